@@ -27,8 +27,8 @@ from emulator.fem import run_campaign
 from emulator.fem.campaign.designs import design
 from emulator.scenes import Scene
 from emulator.scenes.built_in import BUILT_IN
-from emulator.scenes.cavities import cavity_sets
 from emulator.scenes.effects import effects_of, leave_out
+from emulator.scenes.scene import cavity_sets
 from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.taylor import expand
 from emulator.training.mechanics import add_discrepancy

@@ -17,8 +17,8 @@ from emulator.geometry.refinement import to_linear, to_quadratic
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Scene, Support
 from emulator.scenes.built_in.ventricles import MYOCARDIUM, PRESSURE
-from emulator.scenes.cavities import cavity_sets
 from emulator.scenes.loads import CavityPressure, Gravity, PublishedPressure
+from emulator.scenes.scene import cavity_sets
 from emulator.scenes.supports import ElasticSupport
 
 SEED = 7

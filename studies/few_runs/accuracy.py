@@ -21,7 +21,7 @@ import emulator as em
 from emulator.accuracy.comparison import quantiles
 from emulator.fem import Runs, sobol
 from emulator.scenes import BUILT_IN, Scene
-from emulator.scenes.cavities import find_cavity
+from emulator.scenes.scene import find_cavity
 from emulator.surrogates.discrepancy import fit_discrepancy
 from emulator.surrogates.taylor import Expansion
 

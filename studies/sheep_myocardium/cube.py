@@ -99,16 +99,10 @@ def _law_of() -> Scene:
 
 def turned_to(number: int, x: jax.Array) -> jax.Array:
     """Fibre and sheet (2, 3) of a cube at a position (p,) in the box."""
-    f, s, across, along = (v[None, None] for v in _frame(number))
-    one = np.ones((1, 1))
-    angles = (
-        FibreAngles(across, {"in_plane": one}),
-        FibreAngles(along, {"out_of_plane": one}),
-    )
-    given = Tissue(jnp.stack([jnp.asarray(f), jnp.asarray(s)], axis=2))
-    found = turned(given, angles, _law_of().resolve(theta_of(x))).directions
-    assert found is not None
-    return found[0, 0]
+    f, s, across, along = _frame(number)
+    one = np.ones(())
+    angles = (FibreAngles(across, {"in_plane": one}), FibreAngles(along, {"out_of_plane": one}))
+    return turned(jnp.stack([f, s]), angles, _law_of().resolve(theta_of(x)))
 
 
 def theta_of(x: jax.Array) -> jax.Array:

@@ -27,7 +27,7 @@ from emulator.core.store import write_json
 from emulator.fem import Runs, run_campaign, sobol
 from emulator.geometry.facets import Cavity
 from emulator.scenes import Scene
-from emulator.scenes.cavities import cavity_sets
+from emulator.scenes.scene import cavity_sets
 from emulator.surrogates import Architecture, Emulator
 from emulator.training import recipe, train
 from emulator.training.graph_network import GraphNetwork, predictor

@@ -12,8 +12,8 @@ from studies.unloading.bodies import farthest, imaged, some_theta
 import emulator as em
 from emulator.accuracy.comparison import quantiles
 from emulator.scenes import Scene
-from emulator.scenes.cavities import find_cavity
 from emulator.scenes.loads import KPA_PER_MMHG
+from emulator.scenes.scene import find_cavity
 from emulator.surrogates.taylor import expand
 from emulator.training import recipe
 

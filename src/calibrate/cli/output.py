@@ -134,7 +134,7 @@ def volumes(scene: Scene, u: jax.Array, estimate: ErrorEstimate | None = None) -
     import jax
 
     from emulator.geometry.facets import Cavity
-    from emulator.scenes.cavities import cavity_sets
+    from emulator.scenes.scene import cavity_sets
 
     result: Volumes = {}
     for name in cavity_sets(scene):

@@ -22,8 +22,8 @@ from emulator.accuracy.estimate import error_bar
 from emulator.core.errors import InputError
 from emulator.fem import Simulator, Status
 from emulator.geometry.facets import Cavity, surface_mesh
-from emulator.scenes.cavities import cavity_sets
 from emulator.scenes.loads import KPA_PER_MMHG
+from emulator.scenes.scene import cavity_sets
 from emulator.surrogates.emulator import Emulator
 
 

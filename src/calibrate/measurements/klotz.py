@@ -41,9 +41,8 @@ from jax.typing import ArrayLike
 from calibrate.measurements.observation import Scalar
 from calibrate.measurements.volume import CavityVolume
 from emulator.core.errors import InputError
-from emulator.scenes.cavities import inflated_cavity
 from emulator.scenes.loads import KPA_PER_MMHG
-from emulator.scenes.scene import Scene
+from emulator.scenes.scene import Scene, inflated_cavity
 
 PRESSURE_SCATTER = 3.0 * KPA_PER_MMHG
 """Upper bound of the published root mean square errors of pressure, kPa."""

@@ -20,8 +20,7 @@ import numpy as np
 from emulator.core.errors import InputError
 from emulator.geometry.facets import mean_normal
 from emulator.geometry.fibres import circumferential, unit, wall_depth
-from emulator.scenes.cavities import ENDOCARDIUM
-from emulator.scenes.scene import Scene
+from emulator.scenes.scene import ENDOCARDIUM, Scene
 
 EPICARDIUM = "epicardium"
 BASE = "base"

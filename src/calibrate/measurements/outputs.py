@@ -15,7 +15,7 @@ from calibrate.measurements.collection import Observations, observations
 from calibrate.measurements.observation import Observation
 from calibrate.measurements.registry import observations_from_json, parse_observation
 from emulator.accuracy.mesh_error import MeshError, MeshErrorEstimate
-from emulator.scenes.cavities import ENDOCARDIUM
+from emulator.scenes.scene import ENDOCARDIUM
 from emulator.surrogates.protocol import (
     ForwardMap,
     Prediction,

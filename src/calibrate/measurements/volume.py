@@ -12,10 +12,9 @@ import numpy as np
 
 from calibrate.measurements.observation import Scalar
 from emulator.geometry.facets import Cavity
-from emulator.scenes.cavities import find_cavity, inflated_cavity
 from emulator.scenes.loads import KPA_PER_MMHG
 from emulator.scenes.parameter_space import Parameter
-from emulator.scenes.scene import Scene
+from emulator.scenes.scene import Scene, find_cavity, inflated_cavity
 from emulator.surrogates.protocol import ForwardMap
 
 _PRESSURES = 12  # number of pressures of a curve

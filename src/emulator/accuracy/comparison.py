@@ -14,8 +14,7 @@ from scipy.stats import gaussian_kde
 from emulator.core.errors import InputError, SolverError
 from emulator.fem.energy import displacement_gradient, potential_energy
 from emulator.geometry.facets import Cavity
-from emulator.scenes.cavities import cavity_sets
-from emulator.scenes.scene import Scene
+from emulator.scenes.scene import Scene, cavity_sets
 from emulator.surrogates.protocol import ForwardMap
 
 UNITS = {

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import pickle  # arrays and dictionaries only, see _Arrays
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -98,15 +98,11 @@ def _from_npz(path: Path) -> dict[str, np.ndarray]:
 
 def _from_pickle(path: Path) -> dict[str, np.ndarray]:
     try:
-        tree = _Arrays(io.BytesIO(path.read_bytes())).load()
+        return dict(_leaves(_Arrays(io.BytesIO(path.read_bytes())).load()))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except Exception as error:  # a damaged pickle may raise anything
         raise InputError(f"{path} is not a readable pickle") from error
-    try:
-        return dict(_leaves(tree))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
 
 
 def _leaves(tree: Any, names: tuple[str, ...] = ()) -> Iterator[tuple[str, np.ndarray]]:
@@ -129,19 +125,11 @@ class _Arrays(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         """Return what arrays are pickled with; :class:`InputError` for any other name."""
-        if (module, name) in (("numpy", "ndarray"), ("numpy", "dtype")):
-            return getattr(np, name)
-        if name == "_reconstruct" and module in ("numpy.core.multiarray", "numpy._core.multiarray"):
-            return _reconstruct
-        if name == "_frombuffer" and module in ("numpy.core.numeric", "numpy._core.numeric"):
-            return _frombuffer
-        if (module, name) == ("_codecs", "encode"):
-            return _latin1
-        if (module, name) == ("jax._src.array", "_reconstruct_array"):
-            return _of_jax
-        if (module, name) == ("flax.core.frozen_dict", "FrozenDict"):
-            return _dictionary
-        raise InputError(f"asks for {module}.{name}; a pickle of anything but arrays is not read")
+        if (module, name) not in _MAKERS:
+            raise InputError(
+                f"asks for {module}.{name}; a pickle of anything but arrays is not read"
+            )
+        return _MAKERS[module, name]
 
 
 def _reconstruct(kind: type, shape: tuple[int, ...], code: bytes) -> np.ndarray:
@@ -181,3 +169,16 @@ def _latin1(text: str, encoding: str) -> bytes:
     if encoding != "latin1":
         raise InputError(f"asks for the encoding {encoding}; it is not read")
     return text.encode("latin1")
+
+
+_MAKERS: dict[tuple[str, str], Callable[..., Any]] = {
+    ("numpy", "ndarray"): np.ndarray,
+    ("numpy", "dtype"): np.dtype,
+    ("numpy.core.multiarray", "_reconstruct"): _reconstruct,
+    ("numpy._core.multiarray", "_reconstruct"): _reconstruct,
+    ("numpy.core.numeric", "_frombuffer"): _frombuffer,
+    ("numpy._core.numeric", "_frombuffer"): _frombuffer,
+    ("_codecs", "encode"): _latin1,
+    ("jax._src.array", "_reconstruct_array"): _of_jax,
+    ("flax.core.frozen_dict", "FrozenDict"): _dictionary,
+}

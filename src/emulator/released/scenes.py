@@ -7,7 +7,6 @@ clone of the release, or its folder ``data``, can be read as it is.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -109,38 +108,12 @@ def theta_units(model: str) -> np.ndarray:
 
 
 def published_scene(model: str, root: str | Path) -> Scene:
-    """Return the scene of a released model, read from ``root``."""
-    description = _find(model)
-    geometry = read_geometry(root, model)
-    return Scene(
-        name=f"published:{model}",
-        mesh=geometry.mesh,
-        law=find_law(description.law),
-        parameters=description.parameters,
-        loads=description.loads,
-        supports=(Support("held", geometry.displacement),),
-        constants=description.constants,
-        fibres=geometry.fibres,
-        origin={"scene": f"published:{model}", "root": str(Path(root).resolve())},
-    )
+    """Return the scene of a released model, read from ``root``.
 
-
-@dataclass(frozen=True, eq=False)
-class PublishedGeometry:
-    """The geometry of a model.
-
-    mesh : in mm. displacement : (k, 3) mm, prescribed on its node set ``held``.
-    fibres : (m, 3) unit vectors, or None.
+    Its mesh has the node set ``held`` and, if released, the pressed facets.
     """
-
-    mesh: Mesh
-    displacement: np.ndarray
-    fibres: np.ndarray | None
-
-
-def read_geometry(root: str | Path, model: str) -> PublishedGeometry:
-    """Read the mesh of ``model``, with node set ``held`` and, if released, the pressed facets."""
-    scale, folder = units(model).length, "geometryData"
+    description = _find(model)
+    scale, folder = description.units.length, "geometryData"
     nodes = read_array(root, model, f"{folder}/reference-coords.npy", (None, 3)) * scale
     elements = read_array(root, model, f"{folder}/elements.npy", (None, 4)).astype(np.int64)
     if elements.min() < 0 or elements.max() >= len(nodes):
@@ -150,11 +123,9 @@ def read_geometry(root: str | Path, model: str) -> PublishedGeometry:
         raise InputError(
             f"published data: {model} marks {len(interior)} nodes but has {len(nodes)}"
         )
-    fixed_nodes = np.flatnonzero(~interior.astype(bool))
+    held = np.flatnonzero(~interior.astype(bool))
     prescribed = _read_optional(root, model, f"{folder}/disp-add.npy", nodes.shape)
-    displacement = (
-        np.zeros((len(fixed_nodes), 3)) if prescribed is None else prescribed[fixed_nodes] * scale
-    )
+    displacement = np.zeros((len(held), 3)) if prescribed is None else prescribed[held] * scale
     elements = orient(nodes, elements)  # elements and facets of the release are not oriented
     fibres = _read_optional(
         root, model, f"{folder}/fibre-field-elementwise.npy", (len(elements), 3, 1)
@@ -162,8 +133,17 @@ def read_geometry(root: str | Path, model: str) -> PublishedGeometry:
     if fibres is not None:
         fibres = fibres[:, :, 0].astype(float)
         fibres = fibres / np.linalg.norm(fibres, axis=1, keepdims=True)  # stored in float32
-    mesh = Mesh(nodes, elements, {"held": fixed_nodes}, _pressed_facets(root, model, elements))
-    return PublishedGeometry(mesh, displacement, fibres)
+    return Scene(
+        name=f"published:{model}",
+        mesh=Mesh(nodes, elements, {"held": held}, _pressed_facets(root, model, elements)),
+        law=find_law(description.law),
+        parameters=description.parameters,
+        loads=description.loads,
+        supports=(Support("held", displacement),),
+        constants=description.constants,
+        fibres=fibres,
+        origin={"scene": f"published:{model}", "root": str(Path(root).resolve())},
+    )
 
 
 def _pressed_facets(root: str | Path, model: str, elements: np.ndarray) -> dict[str, np.ndarray]:
@@ -183,40 +163,29 @@ def _pressed_facets(root: str | Path, model: str, elements: np.ndarray) -> dict[
     return {PRESSURE_SURFACE: surface[inside]}
 
 
-@dataclass(frozen=True, eq=False)
-class PublishedTests:
+class PublishedTests(NamedTuple):
     """The test solutions of a model.
 
-    theta : (c, p) as stored, in the model's units.
     energy : (c,) least potential energy, mN mm.
     displacement : (c, n, 3) mm, or None where the release has none.
     """
 
-    theta: np.ndarray
     energy: np.ndarray
     displacement: np.ndarray | None
 
 
-def read_tests(root: str | Path, model: str) -> PublishedTests:
-    """Read the test solutions of ``model``."""
+def published_tests(model: str, root: str | Path) -> tuple[jax.Array, PublishedTests]:
+    """Return theta (c, p) in the scene's units, and the stored solutions at these theta."""
     unit, folder = units(model), "simulationData/test"
     theta = read_array(root, model, f"{folder}/theta.npy", (None, None))
     shape = (len(theta), None, 3)
     displacement = _read_optional(root, model, f"{folder}/displacement.npy", shape)
-    return PublishedTests(
-        theta=theta,
-        energy=read_array(root, model, f"{folder}/pe-values.npy", (len(theta),)) * unit.energy,
-        displacement=None if displacement is None else displacement * unit.length,
-    )
-
-
-def published_tests(model: str, root: str | Path) -> tuple[jax.Array, PublishedTests]:
-    """Return theta (c, p) in the scene's units, and the stored solutions at these theta."""
-    parameters = _find(model).parameters
-    tests = read_tests(root, model)
-    if tests.theta.shape[1] != len(parameters):
-        raise InputError(f"published model '{model}': theta has shape {tests.theta.shape}")
-    return jnp.asarray(tests.theta) * theta_units(model), tests
+    energy = read_array(root, model, f"{folder}/pe-values.npy", (len(theta),)) * unit.energy
+    scale = theta_units(model)
+    if theta.shape[1] != len(scale):
+        raise InputError(f"published model '{model}': theta has shape {theta.shape}")
+    in_mm = None if displacement is None else displacement * unit.length
+    return jnp.asarray(theta) * scale, PublishedTests(energy, in_mm)
 
 
 # ---- files ---------------------------------------------------------------------------------------

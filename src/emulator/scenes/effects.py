@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,21 +17,14 @@ import jax.numpy as jnp
 from emulator.core.errors import InputError
 from emulator.geometry.fibres import of_elements
 from emulator.geometry.refinement import corner_parents, to_linear
-from emulator.scenes.checks import directions_read
 from emulator.scenes.scene import Scene
-from emulator.scenes.tissue import effective_angles
+from emulator.scenes.scene_data import directions_read
+from emulator.scenes.tissue import effective_angles, region_quantities
 
 
-@dataclass(frozen=True, eq=False)
-class Effect:
-    """An effect that a scene can do without.
+class Effect(NamedTuple):
+    """The scene ``without`` an effect, and the ``remedy``: the change of a file that removes it."""
 
-    name : the name of the effect.
-    without : the scene without the effect.
-    remedy : the change that removes the effect from a scene file.
-    """
-
-    name: str
     without: Scene
     remedy: str
 
@@ -42,7 +35,7 @@ def effects_of(scene: Scene) -> dict[str, Effect]:
     for name, changes, remedy in _changes(scene):
         without = _change(scene, **changes)
         if without is not None:
-            effects.setdefault(name, Effect(name, without, remedy))
+            effects.setdefault(name, Effect(without, remedy))
     return effects
 
 
@@ -54,16 +47,15 @@ def leave_out(scene: Scene, names: Iterable[str]) -> Scene:
     InputError
         An effect that ``scene`` does not have, or cannot do without.
     """
-    names = tuple(names)
+    simpler = scene
     for name in names:
         if _remove(scene, name) is None:
             raise InputError(
                 f"scene '{scene.name}' has no effect '{name}' that it can do without; it has "
                 f"{', '.join(effects_of(scene)) or 'none'}"
             )
-    for name in names:
-        scene = _remove(scene, name) or scene
-    return scene
+        simpler = _remove(simpler, name) or simpler
+    return simpler
 
 
 def _remove(scene: Scene, effect: str) -> Scene | None:
@@ -99,10 +91,7 @@ class Onto:
         return jnp.mean(u[corner_parents(self.whole.mesh)], axis=1)
 
 
-_Change = tuple[str, dict[str, Any], str]
-
-
-def _changes(scene: Scene) -> Iterator[_Change]:
+def _changes(scene: Scene) -> Iterator[tuple[str, dict[str, Any], str]]:
     """Yield each effect's name, the fields of the scene without it, and the change of its file."""
     for name, law in scene.law.simpler:
         yield name, {"law": law}, f'law = "{law.name}"'
@@ -112,9 +101,11 @@ def _changes(scene: Scene) -> Iterator[_Change]:
             if part.simpler is None:
                 continue
             name, other = part.simpler
-            remaining = (*parts[:k], *((other,) if other is not None else ()), *parts[k + 1 :])
-            remedy = f"in {table} write '{other.kind}' for '{part.kind}'" if other else ""
-            yield name, {field: remaining}, remedy or f"leave out '{part.kind}' in {table}"
+            remaining = [each for each in (*parts[:k], other, *parts[k + 1 :]) if each is not None]
+            remedy = f"leave out '{part.kind}' in {table}"
+            if other is not None:
+                remedy = f"in {table} write '{other.kind}' for '{part.kind}'"
+            yield name, {field: tuple(remaining)}, remedy
     if scene.regions is not None:
         yield "regional stiffness", {"regions": None}, "leave out regions"
     if scene.dilatation != "pointwise":
@@ -133,20 +124,18 @@ def _change(scene: Scene, **changes: Any) -> Scene | None:
 
     Directions, rotations, parameters and constants that nothing reads any more are left out.
     """
-    law = changes.get("law", scene.law)
-    loads = changes.get("loads", scene.loads)
-    regions = changes.get("regions", scene.regions)
+    law, loads, supports, regions = (
+        changes.get(field, getattr(scene, field))
+        for field in ("law", "loads", "supports", "regions")
+    )
     if not loads and not scene.prescribed.moves:
         return None
     for kind, reader in directions_read(law, loads).items():
-        changes.setdefault(kind, getattr(scene, kind))
-        changes[kind] = None if reader is None else changes[kind]
+        changes[kind] = None if reader is None else changes.get(kind, getattr(scene, kind))
     changes["angles"] = effective_angles(scene.angles, changes["fibres"], changes["sheets"])
-    parts = (*loads, *changes.get("supports", scene.supports))
-    names_read = set(law.parameters)
-    names_read |= {q.name for part in (*parts, *changes["angles"]) for q in part.quantities}
-    if regions is not None:
-        names_read |= {name for name in scene.quantities if name.startswith("stiffness_")}
+    names_read = {*law.parameters, *(q.name for q in region_quantities(regions))}
+    for part in (*loads, *supports, *changes["angles"]):
+        names_read |= {quantity.name for quantity in part.quantities}
     try:
         return replace(
             scene,

@@ -60,19 +60,18 @@ class WallRule:
 
     def directions(self, mesh: Mesh) -> Directions:
         """Return fibres and sheets."""
-        return self._directions(self._wall(mesh))
+        angles, sheet_angles = (
+            (0.0 if isinstance(inner, str) else inner, 0.0 if isinstance(outer, str) else outer)
+            for inner, outer in (self.angles, self.sheet_angles)
+        )
+        return turned(self._wall(mesh), angles, self.axis, sheet_angles)
 
     def angles_in(self, mesh: Mesh) -> tuple[FibreAngles, ...]:
         """Return the rotations by parameters: of sheets about the fibres, then of both."""
-        wall = self._wall(mesh)
-        fibres = self._directions(wall)[0]
+        if not any(isinstance(angle, str) for angle in (*self.angles, *self.sheet_angles)):
+            return ()
+        wall, fibres = self._wall(mesh), self.directions(mesh)[0]
         return _rotation(wall.value, fibres, self.sheet_angles) + _rotation(*wall, self.angles)
-
-    def _directions(self, wall: Depth) -> Directions:
-        angles, sheet_angles = (
-            (_degrees(inner), _degrees(outer)) for inner, outer in (self.angles, self.sheet_angles)
-        )
-        return turned(wall, angles, self.axis, sheet_angles)
 
 
 @dataclass(frozen=True)
@@ -142,10 +141,6 @@ class Uniform:
             return ()
         share = np.ones(len(mesh.elements))
         return (FibreAngles(_everywhere(mesh, self.about), {self.angle: share}),)
-
-
-def _degrees(angle: float | str) -> float:
-    return 0.0 if isinstance(angle, str) else float(angle)
 
 
 def _rotation(depth: np.ndarray, axis: np.ndarray, angles: Angles) -> tuple[FibreAngles, ...]:

@@ -16,11 +16,11 @@ from emulator.core.line_index import toml_lines
 from emulator.geometry.io import Body, read_body, read_mesh, read_regions
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.refinement import to_quadratic
-from emulator.geometry.side_by_side import Bodies, check_name, shifted, side_by_side
+from emulator.geometry.side_by_side import check_name, shifted, side_by_side
 from emulator.mechanics.laws import Law, find_law
-from emulator.scenes.checks import directions_read
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
+from emulator.scenes.scene_data import directions_read
 
 if TYPE_CHECKING:  # pydantic is imported when a scene file is read, not with the package
     from emulator.core.schema import Source
@@ -28,10 +28,8 @@ if TYPE_CHECKING:  # pydantic is imported when a scene file is read, not with th
 
 Regions = np.ndarray | None
 
-_AXES = {"x": 0, "y": 1, "z": 2}
 # A node this far from a plane, as a fraction of the body's size, is on it.
 _ON_PLANE = 1e-8
-_BODY = "body"  # the name of the regions where each body is one
 
 
 def read_scene(path: str | Path) -> Scene:
@@ -54,10 +52,7 @@ def read_scene(path: str | Path) -> Scene:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"scene file {path} is not valid TOML: {error}") from error
     source = Source(f"scene file {path}", entries, toml_lines(text))
-    return _scene(path, parse(SceneFile, source), source)
-
-
-def _scene(path: Path, file: SceneFile, source: Source) -> Scene:
+    file = parse(SceneFile, source)
     with source.at("law"):
         law = find_law(file.law)
     body, regions = (_several_bodies if file.bodies else _one_body)(path.parent, file, law, source)
@@ -65,7 +60,10 @@ def _scene(path: Path, file: SceneFile, source: Source) -> Scene:
     if file.fibres is not None:
         with source.at("fibres", table=("fibres",)):
             fibres, sheets = file.fibres.directions(mesh)
-    parameters = _parameters(file, source)
+    parameters = []
+    for name, entry in file.parameters.items():
+        with source.at("parameters", name):
+            parameters.append(Parameter(name, entry.unit, *entry.range, entry.scale))
     _check_sets(mesh, source)
     try:
         return Scene(
@@ -78,7 +76,7 @@ def _scene(path: Path, file: SceneFile, source: Source) -> Scene:
             angles=file.fibres.angles_in(mesh) if file.fibres is not None else (),
             sheets=sheets if law.sheets else None,
             regions=regions,
-            parameters=parameters,
+            parameters=tuple(parameters),
             loads=file.loads,
             supports=file.supports,
             constants=file.constants,
@@ -93,12 +91,10 @@ def _one_body(folder: Path, file: SceneFile, law: Law, source: Source) -> tuple[
     """Return the body of ``mesh``, and its regions."""
     if file.mesh is None:
         raise source.error("key 'mesh' is missing; give a mesh file, or tables [[bodies]]")
-    path = folder / file.mesh
-    with source.at("mesh"):
-        body = _read_body(path, file, law)
-    _check_order(path, body.mesh, file, source)
+    body = _read_body(folder / file.mesh, file, law, source, "mesh")
     with source.at("regions"):
-        return body, None if file.regions is None else read_regions(path, file.regions)
+        regions = None if file.regions is None else read_regions(folder / file.mesh, file.regions)
+    return body, regions
 
 
 def _several_bodies(
@@ -110,51 +106,49 @@ def _several_bodies(
     members: dict[str, Body] = {}
     regions: dict[str, np.ndarray] = {}
     for k, entry in enumerate(file.bodies):
-        path = folder / entry.mesh
         with source.at("bodies", k, "name", table=("bodies", k)):
             check_name(entry.name)
             if entry.name in members:
                 raise InputError(f"there is a body '{entry.name}' before; give each a name")
-        with source.at("bodies", k, "mesh", table=("bodies", k)):
-            body = _read_body(path, file, law)
-            members[entry.name] = replace(body, mesh=shifted(body.mesh, entry.shift))
-        _check_order(path, body.mesh, file, source)
+        body = _read_body(folder / entry.mesh, file, law, source, "bodies", k, "mesh")
+        members[entry.name] = replace(body, mesh=shifted(body.mesh, entry.shift))
         with source.at("regions"):
-            if file.regions == _BODY:
+            if file.regions == "body":  # each body is a region
                 regions[entry.name] = np.full(len(body.mesh.elements), k + 1)
             elif file.regions is not None:
-                regions[entry.name] = read_regions(path, file.regions)
+                regions[entry.name] = read_regions(folder / entry.mesh, file.regions)
     with source.at("bodies"):
         bodies = side_by_side({name: body.mesh for name, body in members.items()})
-        fibres, sheets = (_stack_directions(bodies, members, kind) for kind in ("fibres", "sheets"))
-    return Body(bodies.mesh, fibres, sheets), bodies.stacked(regions) if regions else None
+        stacked = []
+        for kind in ("fibres", "sheets"):
+            values = {name: getattr(body, kind) for name, body in members.items()}
+            some_lack = any(v is None for v in values.values())
+            stacked.append(None if some_lack else bodies.stacked(values))
+    return Body(bodies.mesh, *stacked), bodies.stacked(regions) if regions else None
 
 
-def _stack_directions(bodies: Bodies, members: Mapping[str, Body], kind: str) -> np.ndarray | None:
-    """Return the directions of all bodies; none where one of them has none."""
-    values = {name: getattr(body, kind) for name, body in members.items()}
-    return None if any(v is None for v in values.values()) else bodies.stacked(values)
+def _read_body(path: Path, file: SceneFile, law: Law, source: Source, *entry: str | int) -> Body:
+    """Return the body of the mesh file that ``entry`` names.
 
-
-def _check_order(path: Path, mesh: Mesh, file: SceneFile, source: Source) -> None:
-    if file.order is not None and file.order < mesh.order:
+    It has the directions that law and loads need and no rule gives.
+    """
+    readers = directions_read(law, file.loads)
+    with source.at(*entry, table=entry[:-1]):
+        if readers["fibres"] is None or file.fibres is not None:
+            mesh = read_mesh(path)
+            body = Body(to_quadratic(mesh) if file.order == 2 and mesh.order == 1 else mesh)
+        else:
+            body = read_body(path, quadratic=file.order == 2)
+            for kind, directions in (("fibres", body.fibres), ("sheets", body.sheets)):
+                if readers[kind] is not None and directions is None:
+                    raise InputError(
+                        f"{readers[kind]} needs {kind}, and mesh file {path.name} has none; give "
+                        f"it cell or point data '{kind}' of 3 components, or this file a table "
+                        "[fibres]"
+                    )
+    if file.order is not None and file.order < body.mesh.order:
         problem = f"order = 1; mesh file {path.name} has quadratic tetrahedra, expected 2"
         raise source.error(problem, ("order",))
-
-
-def _read_body(mesh_path: Path, file: SceneFile, law: Law) -> Body:
-    """Return a mesh file's body, with directions that law and loads need and no rule gives."""
-    readers = directions_read(law, file.loads)
-    if readers["fibres"] is None or file.fibres is not None:
-        mesh = read_mesh(mesh_path)
-        return Body(to_quadratic(mesh) if file.order == 2 and mesh.order == 1 else mesh)
-    body = read_body(mesh_path, quadratic=file.order == 2)
-    for kind, directions in (("fibres", body.fibres), ("sheets", body.sheets)):
-        if readers[kind] is not None and directions is None:
-            raise InputError(
-                f"{readers[kind]} needs {kind}, and mesh file {mesh_path.name} has none; give it "
-                f"cell or point data '{kind}' of 3 components, or this file a table [fibres]"
-            )
     return body
 
 
@@ -163,27 +157,28 @@ def _with_planes(mesh: Mesh, file: SceneFile, source: Source) -> Mesh:
     node_sets, facet_sets = dict(mesh.node_sets), dict(mesh.facet_sets)
     for name, plane in file.node_sets.items():
         with source.at("node_sets", name, "at", table=("node_sets", name)):
-            node_sets[name] = np.flatnonzero(_on_plane(mesh, node_sets, plane, "node"))
+            rows = np.arange(len(mesh.nodes))[:, None]
+            node_sets[name] = np.flatnonzero(_on_plane(mesh, node_sets, plane, "node", rows))
     for name, plane in file.facet_sets.items():
         with source.at("facet_sets", name, "at", table=("facet_sets", name)):
-            on_plane = _on_plane(mesh, node_sets, plane, "surface triangle")
-            facet_sets[name] = mesh.surface[on_plane[mesh.surface].all(axis=1)]
+            rows = mesh.surface
+            facet_sets[name] = rows[_on_plane(mesh, node_sets, plane, "surface triangle", rows)]
     return replace(mesh, node_sets=node_sets, facet_sets=facet_sets)
 
 
 def _on_plane(
-    mesh: Mesh, node_sets: Mapping[str, np.ndarray], plane: Plane, member: str
+    mesh: Mesh, node_sets: Mapping[str, np.ndarray], plane: Plane, member: str, rows: np.ndarray
 ) -> np.ndarray:
-    """Return whether each node (n,) lies on the plane; refuse a plane without any ``member``.
+    """Return whether all nodes of ``rows`` (k, a) lie on the plane, (k,); refuse a plane of none.
 
-    member : what the plane must contain, "node" or "surface triangle".
+    member : what a row is, "node" or "surface triangle".
     """
-    coordinate = mesh.nodes[:, _AXES[plane.axis]]
+    coordinate = mesh.nodes[:, "xyz".index(plane.axis)]
     on_plane = np.abs(coordinate - plane.at) <= _ON_PLANE * mesh.size
     if plane.within is not None:
         parent = look_up(node_sets, plane.within, "node set")
         on_plane &= np.isin(np.arange(len(mesh.nodes)), parent)
-    hits = on_plane if member == "node" else on_plane[mesh.surface].all(axis=1)
+    hits = on_plane[rows].all(axis=1)
     if not hits.any():
         low, high = coordinate.min(), coordinate.max()
         inside = f" in '{plane.within}'" if plane.within else ""
@@ -191,15 +186,7 @@ def _on_plane(
             f"no {member} at {plane.axis} = {plane.at:g} mm{inside}; the body is between {low:g} "
             f"and {high:g}"
         )
-    return on_plane
-
-
-def _parameters(file: SceneFile, source: Source) -> tuple[Parameter, ...]:
-    parameters = []
-    for name, entry in file.parameters.items():
-        with source.at("parameters", name):
-            parameters.append(Parameter(name, entry.unit, *entry.range, entry.scale))
-    return tuple(parameters)
+    return hits
 
 
 def _check_sets(mesh: Mesh, source: Source) -> None:

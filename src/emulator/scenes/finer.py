@@ -11,7 +11,6 @@ from emulator.geometry.fibres import across
 from emulator.geometry.refinement import Refinement, refined
 from emulator.scenes.fibre_rules import FibreRule
 from emulator.scenes.scene import Scene
-from emulator.scenes.tissue import FibreAngles
 
 FINER = "finer"
 """The name under which the origin of a scene says that its mesh was refined."""
@@ -45,53 +44,41 @@ def finer(scene: Scene) -> Finer:
         A load that is defined on linear elements only.
     """
     refinement = refined(scene.mesh)
-    children = refinement.children
-    fibres, sheets = _directions(scene, refinement)
-    angles = _angles(scene, refinement) if scene.angles else ()
+    mesh, rule = refinement.mesh, scene.fibre_rule
+    rule = rule if rule is not None and _is_made_by(rule, scene) else None
+    fibres, sheets = _directions(scene, refinement) if rule is None else rule.directions(mesh)
+    angles = rule.angles_in(mesh) if rule is not None and scene.angles else ()
+    if len(angles) != len(scene.angles):
+        raise InputError(
+            f"scene '{scene.name}': fibre angles without the rule that made them have no finer mesh"
+        )
     _, fixed, per_unit = scene.prescribed
     displacements: dict[str | None, np.ndarray] = {None: refinement.carry(fixed)}
     displacements |= {name: refinement.carry(each) for name, each in per_unit.items()}
     fine = replace(
         scene,
-        mesh=refinement.mesh,
+        mesh=mesh,
         fibres=fibres,
-        sheets=sheets,
+        sheets=None if scene.sheets is None else sheets,
         angles=angles,
         # A finer mesh is quadratic, and patches are for linear elements.
         dilatation="mean" if scene.dilatation == "patch" else scene.dilatation,
-        regions=None if scene.regions is None else np.repeat(scene.regions, children),
-        supports=tuple(
-            support.on_finer(refinement.mesh, displacements) for support in scene.supports
-        ),
+        regions=None if scene.regions is None else np.repeat(scene.regions, refinement.children),
+        supports=tuple(support.on_finer(mesh, displacements) for support in scene.supports),
         origin={"scene": FINER, "of": dict(scene.origin)} if scene.origin else {},
     )
     return Finer(scene, fine, refinement)
 
 
 def _directions(scene: Scene, refinement: Refinement) -> tuple[np.ndarray | None, ...]:
-    """Return fibres and sheets on the finer mesh, None where the scene has none."""
-    rule = scene.fibre_rule
-    if rule is not None and _is_made_by(rule, scene):
-        by_rule, sheets_by_rule = rule.directions(refinement.mesh)
-        return by_rule, None if scene.sheets is None else sheets_by_rule
-    fibres = None if scene.fibres is None else refinement.directions(scene.fibres)
-    sheets = None if scene.sheets is None else refinement.directions(scene.sheets)
+    """Return fibres and sheets continued to the finer mesh, None where the scene has none."""
+    fibres, sheets = (
+        None if directions is None else refinement.directions(directions)
+        for directions in (scene.fibres, scene.sheets)
+    )
     if fibres is not None and sheets is not None:
         sheets = across(sheets, fibres)
     return fibres, sheets
-
-
-def _angles(scene: Scene, refinement: Refinement) -> tuple[FibreAngles, ...]:
-    """Return the fibre angles on the finer mesh, by the rule that made them."""
-    rule = scene.fibre_rule
-    angles = (
-        rule.angles_in(refinement.mesh) if rule is not None and _is_made_by(rule, scene) else ()
-    )
-    if len(angles) != len(scene.angles):
-        raise InputError(
-            f"scene '{scene.name}': fibre angles without the rule that made them have no finer mesh"
-        )
-    return angles
 
 
 def _is_made_by(rule: FibreRule, scene: Scene) -> bool:

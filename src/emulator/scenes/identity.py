@@ -19,14 +19,11 @@ import numpy as np
 from emulator.geometry.discretisation import quadrature_points
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws.law import law_identity
-from emulator.scenes.parameter_space import ParameterSpace
 from emulator.scenes.scene_data import SceneData
-from emulator.scenes.supports.dirichlet import Prescribed
 
-# Decimals of lengths in mm that the fingerprint hashes: 1 nm, so that round-off, which differs
-# between machines, hardly ever decides on one.
-_LENGTH_DIGITS = 6
-_DIRECTION_DIGITS = 6  # decimals of unit vectors; some files store them in single precision
+# Decimals that the fingerprint hashes, 1 nm of lengths in mm, so that round-off, which differs
+# between machines, hardly ever decides on one; some files store directions in single precision.
+_DIGITS = 6
 _TOLERANCE = 1e-6  # lengths relative to the body's size, and directions, agree within this
 _HASH_LENGTH = 16  # hexadecimal digits
 
@@ -57,54 +54,22 @@ class Identity:
             and self.description == other.description
         )
 
-    def parts(self) -> list[bytes]:
-        """Return the identity as bytes to hash, lengths and directions rounded."""
-        content = [_text(dict(self.description))]
-        rounded = {name: np.round(v, _LENGTH_DIGITS) for name, v in self.lengths.items()}
-        rounded |= {name: np.round(v, _DIRECTION_DIGITS) for name, v in self.directions.items()}
-        for name, values in sorted(rounded.items()):
-            # Adding 0.0 turns the -0.0 that rounding leaves into 0.0.
-            content += [name.encode(), (values + 0.0).tobytes()]
-        for name, values in sorted(self.indices.items()):
-            content += [name.encode(), values.astype(np.int64).tobytes()]
-        return content
 
-
-def identity_of(scene: SceneData, prescribed: Prescribed) -> Identity:
+def identity_of(scene: SceneData) -> Identity:
     """Return the identity of ``scene``, its elements and facets in a fixed order."""
-    mesh = scene.mesh
+    mesh, (held, fixed, per_unit) = scene.mesh, scene.prescribed
     elements = np.sort(mesh.elements, axis=1)
     order = np.lexsort(elements.T)
-    components, fixed, per_unit = prescribed
     facet_sets = sorted({n for part in (*scene.loads, *scene.supports) for n in part.facet_sets})
-    indices = {"elements": elements[order], "held": components}
+    indices = {"elements": elements[order], "held": held}
     indices |= {f"facets {name}": _as_set(mesh.facet_set(name)) for name in facet_sets}
     if scene.regions is not None:
         indices["regions"] = scene.regions[order]
-    displacements = {f"displacement per unit of {name}": d for name, d in per_unit.items()}
-    return Identity(
-        lengths={"nodes": mesh.nodes, "displacement": fixed, **displacements},
-        directions={
-            name: _points_in_order(mesh, values)[order]
-            for name, values in _directions(scene).items()
-        },
-        indices=indices,
-        description=_description(scene),
-    )
-
-
-def _directions(scene: SceneData) -> dict[str, np.ndarray]:
-    """Return arrays (m, 3), (m, q, 3) or (m, q, 1) by name: fibres, sheets and their rotations."""
     directions = {"fibres": scene.fibres, "sheets": scene.sheets}
     for k, rotation in enumerate(scene.angles):
         directions[f"axis of rotation {k}"] = rotation.axis
         for name, share in rotation.shares.items():
             directions[f"share of {name} in rotation {k}"] = share[..., None]
-    return {name: values for name, values in directions.items() if values is not None}
-
-
-def _description(scene: SceneData) -> dict[str, Any]:
-    """Return plain JSON of everything but arrays."""
     springs = [support.to_json() for support in scene.supports]
     description = {
         "law": law_identity(scene.law),
@@ -114,18 +79,36 @@ def _description(scene: SceneData) -> dict[str, Any]:
         "springs": sorted(json.dumps(spring) for spring in springs if spring is not None),
         "dilatation": scene.dilatation,
     }
-    # Scenes at rest keep the fingerprint of earlier versions, so that saved emulators load.
-    return description | ({"loaded_by": dict(scene.loaded_by)} if scene.loaded_by else {})
+    if scene.loaded_by:  # scenes at rest keep the fingerprint that saved emulators carry
+        description["loaded_by"] = dict(scene.loaded_by)
+    displacements = {f"displacement per unit of {name}": d for name, d in per_unit.items()}
+    return Identity(
+        lengths={"nodes": mesh.nodes, "displacement": fixed, **displacements},
+        directions={
+            name: _points_in_order(mesh, values)[order]
+            for name, values in directions.items()
+            if values is not None
+        },
+        indices=indices,
+        description=description,
+    )
 
 
-def fingerprint(identity: Identity, space: ParameterSpace) -> str:
-    """Return a short hash of an identity and of the order and the box of theta."""
-    box = [[p.name, float(p.low), float(p.high), p.scale] for p in space.parameters]
+def fingerprint(scene: SceneData, identity: Identity) -> str:
+    """Return a short hash of the scene's identity and of the order and the box of theta."""
+    content = [_text(dict(identity.description))]
+    # Adding 0.0 turns the -0.0 that rounding leaves into 0.0.
+    for name, values in sorted({**identity.lengths, **identity.directions}.items()):
+        content += [name.encode(), (np.round(values, _DIGITS) + 0.0).tobytes()]
+    for name, values in sorted(identity.indices.items()):
+        content += [name.encode(), values.astype(np.int64).tobytes()]
+    content.append(
+        _text([[p.name, float(p.low), float(p.high), p.scale] for p in scene.parameters])
+    )
     digest = hashlib.sha256()
-    for part in [*identity.parts(), _text(box)]:
+    for part in content:
         # Lengths mark where each part ends, so that two lists of parts never hash alike.
-        digest.update(len(part).to_bytes(8, "little"))
-        digest.update(part)
+        digest.update(len(part).to_bytes(8, "little") + part)
     return digest.hexdigest()[:_HASH_LENGTH]
 
 

@@ -79,12 +79,7 @@ _SLACK = 1e-9  # round-off allowed, as a fraction of a range
 
 @dataclass(frozen=True)
 class ParameterSpace:
-    """The box that theta lies in, one side a parameter.
-
-    Parameters
-    ----------
-    parameters : the entries of theta, in order.
-    """
+    """The box that theta lies in, one side for each of the ``parameters`` in theta's order."""
 
     parameters: tuple[Parameter, ...]
 
@@ -112,27 +107,10 @@ class ParameterSpace:
         columns = [p.from_unit(position[..., k]) for k, p in enumerate(self.parameters)]
         return jnp.stack(columns, axis=-1)
 
-    def unit_sensitivities(self, theta: jax.Array, du_dtheta: jax.Array) -> jax.Array:
-        r"""Return sensitivities in the unit box from those in the units of the parameters.
-
-        .. math:: \partial u / \partial x_k
-            = (\partial u / \partial \theta_k)\, \mathrm{d}\theta_k / \mathrm{d}x_k
-
-        Parameters
-        ----------
-        theta : the parameters, (c, p).
-        du_dtheta : the sensitivities (c, p, n, 3) in mm per unit of each parameter.
-
-        Returns
-        -------
-        (c, p, n, 3) mm.
-        """
-        return du_dtheta * self.rates(theta)[:, :, None, None]
-
     def rates(self, theta: jax.Array) -> jax.Array:
-        """Return the derivatives (c, p) of ``theta`` (c, p) in its position in the box."""
-        columns = [p.rate(theta[:, k]) for k, p in enumerate(self.parameters)]
-        return jnp.stack(columns, axis=1)
+        """Return the derivatives (..., p) of ``theta`` (..., p) in its position in the box."""
+        columns = [p.rate(theta[..., k]) for k, p in enumerate(self.parameters)]
+        return jnp.stack(columns, axis=-1)
 
     def contains(self, theta: jax.Array) -> jax.Array:
         """Return whether ``theta`` (..., p) lies in the box, (...) bool; NaN does not."""

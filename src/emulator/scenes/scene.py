@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from types import MappingProxyType
 from typing import Any, cast
 
 import jax
@@ -17,26 +16,16 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.core.representation import TableRepr
-from emulator.geometry.discretisation import (
-    Blocks,
-    Discretisation,
-    discretise,
-    quadrature_points,
-)
+from emulator.geometry.discretisation import Blocks, Discretisation, discretise, quadrature_points
+from emulator.geometry.facets import Cavity, encloses
 from emulator.geometry.patches import patchwise
-from emulator.mechanics.laws.law import Quantity
-from emulator.scenes.checks import check_scene, checked_tissue, load_parameters, owners_of
 from emulator.scenes.identity import Identity, fingerprint, identity_of
 from emulator.scenes.parameter_space import ParameterSpace
 from emulator.scenes.scene_data import SceneData
-from emulator.scenes.supports.dirichlet import Prescribed, prescribe
-from emulator.scenes.tissue import (
-    Fibres,
-    Tissue,
-    at_every_point,
-    tissue_of,
-    turned,
-)
+from emulator.scenes.tissue import Fibres, Tissue, at_every_point, turned
+
+ENDOCARDIUM = "endocardium"
+"""The facet set that is a cavity's wall also where no pressure acts on it."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -46,16 +35,6 @@ class Scene(SceneData, TableRepr):
     The fields are listed in :class:`~emulator.scenes.scene_data.SceneData`. They are checked, and
     frozen, arrays included, so that compiled functions of the scene never go stale.
     """
-
-    def __post_init__(self) -> None:
-        for name in ("constants", "origin", "loaded_by"):
-            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
-        try:
-            for name, value in checked_tissue(self).items():
-                object.__setattr__(self, name, value)
-            check_scene(self, self.prescribed)
-        except InputError as error:
-            raise InputError(f"scene '{self.name}': {error}") from error
 
     # Theta: the parameters, in their box.
 
@@ -68,16 +47,6 @@ class Scene(SceneData, TableRepr):
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the entries of theta, in order."""
         return self.space.names
-
-    @property
-    def load_parameters(self) -> tuple[str, ...]:
-        """Entries of theta that belong to loads or move supports; the others are the body's."""
-        return load_parameters(self, self.prescribed)
-
-    @property
-    def quantities(self) -> dict[str, Quantity]:
-        """Every parameter that law, loads, supports and regions take, by name."""
-        return {name: quantity for name, (quantity, _) in owners_of(self).items()}
 
     @property
     def centre(self) -> jax.Array:
@@ -136,12 +105,15 @@ class Scene(SceneData, TableRepr):
 
     def fibres_at(self, theta: jax.Array) -> jax.Array:
         """Return unit fibre directions (m, q, 3) at ``theta`` (p,); of a scene with fibres."""
-        at_zero = Tissue(jnp.asarray(self.fibres_at_points))
-        return cast(Any, turned(at_zero, self.angles, self.resolve(theta)).directions)
+        return jnp.asarray(turned(self.fibres_at_points, self.angles, self.resolve(theta)))
 
     def tissue_at(self, theta: jax.Array) -> Tissue:
         """Return material data at ``theta`` (p,), stacked over elements and points, (m, q, ...)."""
-        return turned(self._tissue, self.angles, self.resolve(theta))
+        tissue = self._tissue
+        if tissue.directions is None:
+            return tissue
+        directions = turned(tissue.directions, self.angles, self.resolve(theta))
+        return tissue._replace(directions=directions)
 
     def block_tissue_at(self, theta: jax.Array) -> Tissue:
         """Return material data at ``theta`` (p,) stacked over :attr:`blocks`, (b, q, ...)."""
@@ -151,21 +123,21 @@ class Scene(SceneData, TableRepr):
 
     @cached_property
     def _tissue(self) -> Tissue:
-        order = self.mesh.order
-        fibres = self.fibres_at_points if self.law.fibres else None
-        sheets = None if self.sheets is None else at_every_point(self.sheets, order)
-        return tissue_of(fibres, sheets, self.regions, len(quadrature_points(order)))
+        # NumPy arrays: JAX arrays made inside jit would be tracers, and a scene keeps these.
+        order, region = self.mesh.order, None
+        directions = self.fibres_at_points if self.law.fibres else None
+        if directions is not None and self.sheets is not None:
+            directions = np.stack([directions, at_every_point(self.sheets, order)], axis=2)
+        if self.regions is not None:
+            index = np.unique(self.regions, return_inverse=True)[1][:, None]
+            region = np.broadcast_to(index, (len(index), len(quadrature_points(order))))
+        return Tissue(cast(Any, directions), cast(Any, region))
 
     @cached_property
     def _block_tissue(self) -> Tissue:
         return jax.tree.map(self.blocks.gather, self._tissue)
 
     # Prescribed displacements.
-
-    @cached_property
-    def prescribed(self) -> Prescribed:
-        """The displacements that supports prescribe, in mm."""
-        return prescribe(self.mesh, self.supports)
 
     @property
     def held(self) -> np.ndarray:
@@ -177,20 +149,20 @@ class Scene(SceneData, TableRepr):
         """Prescribed displacement in mm that no parameter scales, zero elsewhere, (n, 3)."""
         return self.prescribed.displacement
 
-    def held_at(self, theta: jax.Array, nodes: np.ndarray | None = None) -> jax.Array:
+    def held_at(self, theta: jax.Array, nodes: np.ndarray | slice = slice(None)) -> jax.Array:
         """Return the prescribed displacement in mm at ``theta`` (..., p), zero elsewhere.
 
         The shape is (n, 3), or (k, 3) at ``nodes`` (k,), where no parameter scales it, else
         (..., n, 3).
         """
         values = self.resolve(jnp.moveaxis(jnp.asarray(theta), -1, 0))
-        return self.prescribed.at(values, slice(None) if nodes is None else nodes)
+        return self.prescribed.at(values, nodes)
 
     def on_supports(
         self,
         u: jax.Array,
         theta: jax.Array,
-        nodes: np.ndarray | None = None,
+        nodes: np.ndarray | slice = slice(None),
         *,
         level: jax.Array | float = 1.0,
     ) -> jax.Array:
@@ -203,20 +175,19 @@ class Scene(SceneData, TableRepr):
         nodes : the numbers (k,) of the nodes; all by default.
         level : the fraction of the prescribed displacements that is applied.
         """
-        prescribed = self.held if nodes is None else self.held[nodes]
-        return jnp.where(prescribed, level * self.held_at(theta, nodes), u)
+        return jnp.where(self.held[nodes], level * self.held_at(theta, nodes), u)
 
     # Identity and summary.
 
     @cached_property
     def identity(self) -> Identity:
         """Everything the solutions depend on; see :mod:`emulator.scenes.identity`."""
-        return identity_of(self, self.prescribed)
+        return identity_of(self)
 
     @cached_property
     def fingerprint(self) -> str:
         """Short hash of the identity, and of the order and the box of theta."""
-        return fingerprint(self.identity, self.space)
+        return fingerprint(self, self.identity)
 
     def summary_rows(self) -> tuple[str, list[tuple[str, str]]]:
         """Return the title, and rows of mesh, law, loads, supports and theta."""
@@ -251,3 +222,44 @@ def check_nodes(scene: Scene, nodes: np.ndarray) -> np.ndarray:
             f"{len(scene.mesh.nodes) - 1}"
         )
     return nodes
+
+
+# Cavities: facet sets that enclose a volume.
+
+
+def cavity_sets(scene: Scene) -> tuple[str, ...]:
+    """Return the facet sets that enclose a volume: sets under pressure, and ``endocardium``."""
+    pressed = [load.pressed for load in scene.loads if load.pressed is not None]
+    endocardium = [ENDOCARDIUM] if ENDOCARDIUM in scene.mesh.facet_sets else []
+    names = dict.fromkeys([*pressed, *endocardium])
+    return tuple(name for name in names if encloses(scene.mesh, name))
+
+
+def inflated_cavity(scene: Scene) -> tuple[str, str] | None:
+    """Return wall and pressure of the first cavity whose pressure is a parameter, or None."""
+    closed = cavity_sets(scene)
+    for load in scene.loads:
+        if load.pressed in closed:
+            for quantity in load.quantities:
+                if quantity.name in scene.parameter_names:
+                    return str(load.pressed), quantity.name
+    return None
+
+
+def find_cavity(scene: Scene, facet_set: str | None = None) -> Cavity:
+    """Return the cavity whose wall is ``facet_set``; by default the only one of the scene.
+
+    Raises
+    ------
+    InputError
+        The set is missing or encloses no volume; several cavities, or none, and no name.
+    """
+    if facet_set is not None:
+        return Cavity(scene.mesh, facet_set)
+    names = cavity_sets(scene)
+    if len(names) != 1:
+        known = ", ".join(names or sorted(scene.mesh.facet_sets)) or "none"
+        raise InputError(
+            f"scene '{scene.name}' has {len(names)} cavities; name a facet set: {known}"
+        )
+    return Cavity(scene.mesh, names[0])

@@ -1,20 +1,34 @@
-"""The description of a scene: all that a user says of it."""
+"""The description of a scene: all that a user says of it, checked and frozen.
+
+Each parameter has an owner, directions have readers, and the body is fixed.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any, Literal, get_args
 
 import numpy as np
 
+from emulator.core.errors import InputError
+from emulator.geometry.fibres import check_across, checked_directions
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws import Law
+from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.fibre_rules import FibreRule
-from emulator.scenes.loads.load import Load
 from emulator.scenes.parameter_space import Parameter
-from emulator.scenes.supports.boundary_condition import BoundaryCondition
-from emulator.scenes.tissue import FibreAngles
+from emulator.scenes.part import BoundaryCondition, Load, Prescribed
+from emulator.scenes.supports.dirichlet import check_motions, prescribe
+from emulator.scenes.tissue import (
+    FibreAngles,
+    at_every_point,
+    checked_regions,
+    effective_angles,
+    region_quantities,
+)
 
 Dilatation = Literal["pointwise", "mean", "patch"]
 """The part of a body that shares a volume change: a point, an element, or a patch of elements."""
@@ -71,3 +85,169 @@ class SceneData:
     fibre_rule: FibreRule | None = None
     angles: tuple[FibreAngles, ...] = ()
     loaded_by: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("constants", "origin", "loaded_by"):
+            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+        try:
+            self._check_tissue()
+            prescribed = self.prescribed  # refuses supports that contradict one another
+            self._check_parameters()
+            self._check_dilatation()
+            if not self.parameters:
+                raise InputError("no parameter varies, nothing to calibrate")
+            if not self.supports:
+                raise InputError("no support, the body could move freely")
+            check_motions(self.mesh, self.supports)
+            for part in (*self.loads, *self.supports):
+                for name in part.facet_sets:
+                    self.mesh.facet_set(name)
+                if "node_set" in vars(part):
+                    self.mesh.node_set(vars(part)["node_set"])
+            for load in self.loads:
+                load.check(self.mesh, prescribed)
+            self._check_image()
+        except InputError as error:
+            raise InputError(f"scene '{self.name}': {error}") from error
+
+    @cached_property
+    def prescribed(self) -> Prescribed:
+        """The displacements that supports prescribe, in mm."""
+        return prescribe(self.mesh, self.supports)
+
+    @property
+    def load_parameters(self) -> tuple[str, ...]:
+        """Entries of theta that belong to loads or move supports; the others are the body's."""
+        names = {quantity.name for load in self.loads for quantity in load.quantities}
+        names |= set(self.prescribed.per_unit)
+        return tuple(parameter.name for parameter in self.parameters if parameter.name in names)
+
+    @property
+    def quantities(self) -> dict[str, Quantity]:
+        """Every parameter that law, loads, supports and regions take, by name."""
+        return {name: quantity for name, (quantity, _) in self._owners().items()}
+
+    def _owners(self) -> dict[str, tuple[Quantity, str]]:
+        """Return every parameter and its owner in words; loads may share one, and so may supports.
+
+        Raises
+        ------
+        InputError
+            Two owners of different kinds have a parameter of one name, or ``loaded_by`` names a
+            parameter that no load has.
+        """
+        owners = {q.name: (q, f"law '{self.law.name}'") for q in self.law.quantities}
+        owners |= {q.name: (q, "a region") for q in region_quantities(self.regions)}
+        groups = (("the fibres'", self.angles), ("load", self.loads), ("support", self.supports))
+        for noun, parts in groups:
+            of_other_kinds = set(owners)
+            for part in parts:
+                owner = f"{noun} {type(part).__name__}"
+                for quantity in part.quantities:
+                    if quantity.name in of_other_kinds:
+                        raise InputError(
+                            f"{owner} and {owners[quantity.name][1]} both have a parameter "
+                            f"'{quantity.name}'; call the {noun}'s by another name"
+                        )
+                    owners.setdefault(quantity.name, (quantity, owner))
+        of_loads = {quantity.name: quantity for load in self.loads for quantity in load.quantities}
+        for load, image in self.loaded_by.items():
+            if load not in of_loads:
+                known = ", ".join(of_loads) or "none"
+                raise InputError(
+                    f"loaded_by: '{load}' is no parameter of a load; there are {known}"
+                )
+            quantity = replace(of_loads[load], name=image)
+            owners.setdefault(image, (quantity, f"'{load}' in the image"))
+        return owners
+
+    def _check_tissue(self) -> None:
+        """Refuse regions, directions and angles that do not fit; keep them as frozen arrays."""
+        mesh, tissue = self.mesh, dict[str, Any](fibres=None, sheets=None)
+        if self.regions is not None:
+            tissue["regions"] = checked_regions(self.regions, len(mesh.elements), self.law)
+        for kind, reader in directions_read(self.law, self.loads).items():
+            directions = getattr(self, kind)
+            if directions is None and reader is not None:
+                raise InputError(f"{reader} needs {kind}")
+            if directions is not None and reader is None:
+                raise InputError(f"law '{self.law.name}' takes no {kind}")
+            if directions is not None:
+                tissue[kind] = checked_directions(directions, mesh, kind)
+        fibres, sheets = tissue["fibres"], tissue["sheets"]
+        if self.angles and fibres is None:
+            raise InputError("fibre angles turn fibres, and it has none")
+        tissue["angles"] = tuple(rotation.checked(mesh) for rotation in self.angles)
+        if len(effective_angles(tissue["angles"], fibres, sheets)) < len(self.angles):
+            raise InputError("sheet angles turn sheets, and its law takes none")
+        if fibres is not None and sheets is not None:
+            check_across(at_every_point(sheets, mesh.order), at_every_point(fibres, mesh.order))
+        for name, value in tissue.items():
+            object.__setattr__(self, name, value)
+
+    def _check_parameters(self) -> None:
+        """Refuse unknown, repeated or missing names, and inadmissible units or values."""
+        owners = self._owners()
+        names = [*(parameter.name for parameter in self.parameters), *self.constants]
+        for name in names:
+            if name not in owners:
+                raise InputError(
+                    f"parameter '{name}' is not one of law '{self.law.name}', its loads and "
+                    f"supports: {', '.join(owners)}"
+                )
+            if names.count(name) > 1:
+                raise InputError(f"parameter '{name}' is given twice")
+        for name, (_, owner) in owners.items():
+            if name not in names:
+                raise InputError(f"{owner} needs '{name}'")
+        faults = [owners[name][0].value_fault(value) for name, value in self.constants.items()]
+        for parameter in self.parameters:
+            quantity, owner = owners[parameter.name]
+            faults.append(quantity.unit_fault(parameter.unit, owner))
+            faults.append(quantity.range_fault(parameter.low, parameter.high))
+        for fault in filter(None, faults):
+            raise InputError(fault)
+
+    def _check_dilatation(self) -> None:
+        """Refuse an unknown ``dilatation``, or one that the elements do not have."""
+        if self.dilatation not in get_args(Dilatation):
+            raise InputError(
+                f"dilatation '{self.dilatation}'; use pointwise or mean, or patch on linear "
+                "tetrahedra"
+            )
+        if self.dilatation == "mean" and self.mesh.order == 1:
+            raise InputError(
+                "mean dilatation on linear tetrahedra changes nothing, they have one point each; "
+                "make the mesh quadratic, or write dilatation 'patch'"
+            )
+        if self.dilatation == "patch" and self.mesh.order == 2:
+            raise InputError(
+                "patch dilatation is for linear tetrahedra; on quadratic ones write dilatation "
+                "'mean'"
+            )
+
+    def _check_image(self) -> None:
+        """Refuse a load in theta without a value in the image, and one for a constant load."""
+        loads = self.load_parameters
+        for name in loads if self.loaded_by else ():
+            if name not in self.loaded_by:
+                raise InputError(
+                    f"loaded_by says nothing of '{name}'; name the parameter or constant that "
+                    "holds its value in the image"
+                )
+        for name in self.loaded_by:
+            if name not in loads:
+                raise InputError(
+                    f"loaded_by: '{name}' is a constant, so the mesh is loaded by it anyway; "
+                    "leave it out, or make it a parameter"
+                )
+
+
+def directions_read(law: Law, loads: Sequence[Load]) -> dict[str, str | None]:
+    """Return the first reader of ``fibres`` and of ``sheets``, in words; None without a reader."""
+    readers = [f"law '{law.name}'"] if law.fibres else []
+    readers += [f"load '{load.kind}'" for load in loads if load.fibres]
+    return {
+        "fibres": readers[0] if readers else None,
+        "sheets": f"law '{law.name}'" if law.sheets else None,
+    }

@@ -26,7 +26,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,9 +37,9 @@ from emulator.geometry.discretisation import quadrature_points
 from emulator.geometry.fibres import checked_directions
 from emulator.geometry.mesh import Mesh, frozen_array
 from emulator.mechanics.laws.law import Law, Quantity, number
-from emulator.scenes.part import Values
 
-_FULL_TURN = 360.0  # degrees
+Values = Mapping[str, jax.Array]
+"""Parameters and constants of a scene by name."""
 
 
 class Tissue(NamedTuple):
@@ -51,27 +51,6 @@ class Tissue(NamedTuple):
 
     directions: jax.Array | None = None
     region: jax.Array | None = None
-
-
-def tissue_of(
-    fibres: np.ndarray | None, sheets: np.ndarray | None, regions: np.ndarray | None, points: int
-) -> Tissue:
-    """Return material data with leading axes (m, q).
-
-    Parameters
-    ----------
-    fibres, sheets : the unit directions (m, q, 3), or None.
-    regions : the labels (m,), or None.
-    points : the number q of quadrature points of an element.
-    """
-    directions, region = fibres, None
-    if fibres is not None and sheets is not None:
-        directions = np.stack([fibres, sheets], axis=2)
-    if regions is not None:
-        index = np.unique(regions, return_inverse=True)[1][:, None]
-        region = np.broadcast_to(index, (len(index), points))
-    # NumPy arrays: JAX arrays made inside jit would be tracers, and a scene keeps these.
-    return Tissue(cast(Any, directions), cast(Any, region))
 
 
 def at_every_point(directions: np.ndarray, order: int) -> np.ndarray:
@@ -89,9 +68,10 @@ def factors(regions: np.ndarray | None, values: Mapping[str, Any]) -> jax.Array 
     return jnp.stack([jnp.asarray(values[q.name]) for q in region_quantities(regions)])
 
 
-def region_quantities(regions: np.ndarray) -> tuple[Quantity, ...]:
+def region_quantities(regions: np.ndarray | None) -> tuple[Quantity, ...]:
     """Return the factors of ``regions`` (m,), by ascending label: ``stiffness_1`` and so on."""
-    return tuple(number(f"stiffness_{label}") for label in np.unique(regions).tolist())
+    labels = () if regions is None else np.unique(regions).tolist()
+    return tuple(number(f"stiffness_{label}") for label in labels)
 
 
 def checked_regions(regions: object, elements: int, law: Law) -> np.ndarray:
@@ -128,7 +108,7 @@ class FibreAngles:
     @property
     def quantities(self) -> tuple[Quantity, ...]:
         """The parameters, angles in degrees."""
-        return tuple(Quantity(name, "deg", -_FULL_TURN, _FULL_TURN) for name in self.shares)
+        return tuple(Quantity(name, "deg", -360.0, 360.0) for name in self.shares)
 
     def checked(self, mesh: Mesh) -> FibreAngles:
         """Return the same rotation with frozen arrays (m, q, ...).
@@ -139,9 +119,8 @@ class FibreAngles:
             Arrays do not fit the elements of ``mesh``, axes are no unit vectors, or shares are not
             finite.
         """
-        points = len(quadrature_points(mesh.order))
         axis = checked_directions(self.axis, mesh, "axes of fibre angles")
-        wide = (len(mesh.elements), points)
+        wide = (len(mesh.elements), len(quadrature_points(mesh.order)))
         shares = {}
         for name, values in self.shares.items():
             share = np.asarray(values, dtype=float)
@@ -152,44 +131,15 @@ class FibreAngles:
                     f"expected {wide[:1]} or {wide}"
                 )
             shares[name] = frozen_array(np.broadcast_to(share, wide))
-        axis = axis if axis.ndim == 3 else axis[:, None]
-        return FibreAngles(frozen_array(np.broadcast_to(axis, (*wide, 3))), shares)
-
-    def turns(self, fibres: np.ndarray) -> bool:
-        """Return whether ``fibres`` (m, 3) or (m, q, 3) turn, and not only sheets about them."""
-        along = np.sum(self.axis * (fibres if fibres.ndim == 3 else fibres[:, None]), axis=-1)
-        return not np.allclose(np.abs(along), 1.0)
-
-    def turned(self, tissue: Tissue, values: Values) -> Tissue:
-        """Return ``tissue`` (m, q, ...) with directions turned by the angles among ``values``."""
-        assert tissue.directions is not None, "a scene's angles are checked against its directions"
-        angle = jnp.deg2rad(sum(values[name] * share for name, share in self.shares.items()))
-        d = jnp.asarray(tissue.directions)
-        more = d.ndim - self.axis.ndim  # an axis for fibre and sheet
-        n = jnp.expand_dims(jnp.asarray(self.axis), tuple(range(2, 2 + more)))
-        c, s = (jnp.expand_dims(f(angle), tuple(range(2, 3 + more))) for f in (jnp.cos, jnp.sin))
-        along = jnp.sum(n * d, axis=-1, keepdims=True)
-        return tissue._replace(directions=c * d + s * jnp.cross(n, d) + (1.0 - c) * along * n)
+        return FibreAngles(frozen_array(at_every_point(axis, mesh.order)), shares)
 
 
-def checked_angles(
-    angles: Sequence[FibreAngles], mesh: Mesh, fibres: np.ndarray | None, sheets: np.ndarray | None
-) -> tuple[FibreAngles, ...]:
-    """Return the rotations of a scene with checked, frozen arrays.
-
-    Raises
-    ------
-    InputError
-        A scene without fibres, sheet angles without sheets, or arrays that do not fit its mesh.
-    """
-    if not angles:
-        return ()
-    if fibres is None:
-        raise InputError("fibre angles turn fibres, and it has none")
-    checked = tuple(each.checked(mesh) for each in angles)
-    if len(effective_angles(checked, fibres, sheets)) < len(checked):
-        raise InputError("sheet angles turn sheets, and its law takes none")
-    return checked
+# So that loads can hand their fibres to JAX, which takes them element by element.
+jax.tree_util.register_pytree_node(
+    FibreAngles,
+    lambda angles: ((angles.axis, dict(angles.shares)), None),
+    lambda _, arrays: FibreAngles(*arrays),
+)
 
 
 def effective_angles(
@@ -198,19 +148,35 @@ def effective_angles(
     """Return the rotations that change any of these directions, (m, 3) or (m, q, 3)."""
     if fibres is None:
         return ()
-    return tuple(each for each in angles if sheets is not None or each.turns(fibres))
+    if sheets is not None:
+        return tuple(angles)
+    each_point = fibres if fibres.ndim == 3 else fibres[:, None]
+    cosines = (np.sum(rotation.axis * each_point, axis=-1) for rotation in angles)
+    return tuple(a for a, c in zip(angles, cosines, strict=True) if not np.allclose(np.abs(c), 1.0))
 
 
-def turned(tissue: Tissue, angles: tuple[FibreAngles, ...], values: Values) -> Tissue:
-    """Return ``tissue`` (m, q, ...) with its directions turned by one rotation after the other."""
-    for each in angles:
-        tissue = each.turned(tissue, values)
-    return tissue
+def turned(directions: Any, angles: Sequence[FibreAngles], values: Values) -> Any:
+    """Return ``directions`` turned by one rotation after the other, by the angles in ``values``.
+
+    Parameters
+    ----------
+    directions : the fibres (..., 3), or fibres and sheets (..., 2, 3).
+    angles : the rotations, with axes (..., 3).
+    values : the parameters of the scene by name.
+    """
+    for rotation in angles:
+        angle = jnp.deg2rad(sum(values[name] * share for name, share in rotation.shares.items()))
+        d, n = jnp.asarray(directions), jnp.asarray(rotation.axis)
+        c, s = jnp.cos(angle)[..., None], jnp.sin(angle)[..., None]
+        if d.ndim > n.ndim:  # an axis for fibre and sheet
+            n, c, s = n[..., None, :], c[..., None], s[..., None]
+        along = jnp.sum(n * d, axis=-1, keepdims=True)
+        directions = c * d + s * jnp.cross(n, d) + (1.0 - c) * along * n
+    return directions
 
 
-@dataclass(frozen=True, eq=False)
-class Fibres:
-    """The fibres of a scene in the form that loads along them take, element by element.
+class Fibres(NamedTuple):
+    """The fibres of a scene in the form that loads along them take; arrays begin with the element.
 
     directions : the unit vectors (m, q, 3) at the quadrature points, angles zero; traced where the
         stress-free shape is an unknown.
@@ -220,24 +186,6 @@ class Fibres:
     directions: Any
     angles: tuple[FibreAngles, ...] = ()
 
-    def some(self, elements: np.ndarray) -> Fibres:
-        """Return the fibres of ``elements`` (k,)."""
-        angles = [
-            FibreAngles(each.axis[elements], {n: s[elements] for n, s in each.shares.items()})
-            for each in self.angles
-        ]
-        return Fibres(self.directions[elements], tuple(angles))
-
-    @property
-    def rows(self) -> Any:
-        """Arrays with the leading axis m, of which :meth:`of_element` takes a row."""
-        return self.directions, [(each.axis, dict(each.shares)) for each in self.angles]
-
-    @staticmethod
-    def of_element(row: Any, values: Values) -> jax.Array:
-        """Return the unit fibres (q, 3) of one element at the parameters ``values``."""
-        directions, rotations = jax.tree.map(lambda array: array[None], row)
-        angles = tuple(FibreAngles(axis, shares) for axis, shares in rotations)
-        fibres = turned(Tissue(directions), angles, values).directions
-        assert fibres is not None
-        return fibres[0]
+    def at(self, values: Values) -> jax.Array:
+        """Return the unit fibres (m, q, 3), or (q, 3) of one element, at the parameters."""
+        return turned(self.directions, self.angles, values)

@@ -178,7 +178,7 @@ def _remainder(
     """Return FEM minus ``mean_map``: fields (c, n, 3) and derivatives in position (c, p, n, 3)."""
     fields = np.asarray(runs.displacement)
     assert runs.sensitivities is not None, "checked above"
-    derivatives = np.array(scene.space.unit_sensitivities(runs.theta, runs.sensitivities))
+    derivatives = np.array(runs.sensitivities * scene.space.rates(runs.theta)[..., None, None])
     if mean_map is None:
         return fields, derivatives
     fields = fields - np.asarray(jax.jit(jax.vmap(mean_map))(positions))

@@ -12,7 +12,7 @@ from studies.stability.solver.bodies import DOWN, bar, moduli
 from studies.stability.solver.case import SEED, Case, case, simulator_of
 
 from emulator import NewtonOptions, Scene, Simulator
-from emulator.scenes.built_in.twisting_cube import twist
+from emulator.scenes.built_in.boxes import twist
 from emulator.scenes.loads import Gravity
 
 

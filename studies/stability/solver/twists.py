@@ -10,7 +10,7 @@ from studies.stability.solver.case import CASES, Case, case
 
 from emulator import Support
 from emulator.geometry.generators.box import box
-from emulator.scenes.built_in.twisting_cube import twist
+from emulator.scenes.built_in.boxes import twist
 
 
 def _twisted(degrees: float, *, started: bool) -> Case:

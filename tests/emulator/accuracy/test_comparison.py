@@ -5,7 +5,7 @@ import pytest
 import emulator as em
 from emulator.accuracy.comparison import case_errors, evaluate, field_errors
 from emulator.core.errors import SolverError
-from emulator.scenes.cavities import find_cavity
+from emulator.scenes.scene import find_cavity
 from emulator.surrogates.fem import fem_forward
 from emulator.surrogates.protocol import Extrapolated
 from network_support import untrained

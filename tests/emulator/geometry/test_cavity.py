@@ -10,8 +10,8 @@ from emulator.core.errors import InputError
 from emulator.geometry.facets import openings
 from emulator.geometry.generators.ellipsoid import LAND, EllipsoidalWall, truncated_ellipsoid
 from emulator.scenes import Support
-from emulator.scenes.cavities import cavity_sets, find_cavity
 from emulator.scenes.loads import CavityPressure
+from emulator.scenes.scene import cavity_sets, find_cavity
 from scene_support import block, slope
 
 # A hemisphere of radius 10 mm: its base plane goes through the centre.

@@ -7,8 +7,6 @@ from emulator.released.scenes import (
     models_in,
     published_scene,
     published_tests,
-    read_geometry,
-    read_tests,
 )
 
 
@@ -28,7 +26,7 @@ def test_the_built_in_cube_is_twisted_like_the_released_one(published):
 
 
 def test_units(published):
-    mesh = read_geometry(published, "OnceClampedBeam").mesh
+    mesh = published_scene("OnceClampedBeam", published).mesh
     np.testing.assert_allclose(np.ptp(mesh.nodes, axis=0), [100.0, 10.0, 10.0])
     thetas, tests = published_tests("OnceClampedBeam", published)
     assert thetas.min() >= 50.0
@@ -40,26 +38,26 @@ def test_units(published):
 
 def test_missing_and_damaged_files_are_named(tmp_path):
     with pytest.raises(InputError, match=r"reference-coords.npy is missing"):
-        read_geometry(tmp_path, "OnceClampedBeam")
+        published_scene("OnceClampedBeam", tmp_path)
     with pytest.raises(InputError, match="published model 'Heart' is unknown"):
-        read_geometry(tmp_path, "Heart")
+        published_scene("Heart", tmp_path)
     geometry = tmp_path / "OnceClampedBeam" / "geometryData"
     geometry.mkdir(parents=True)
     np.save(geometry / "reference-coords.npy", np.eye(4, 3))
     np.save(geometry / "elements.npy", np.array([[0, 1, 2, 9]]))
     with pytest.raises(InputError, match="name nodes there are none of"):
-        read_geometry(tmp_path, "OnceClampedBeam")
+        published_scene("OnceClampedBeam", tmp_path)
     np.save(geometry / "elements.npy", np.array([[0, 1, 2]]))
     with pytest.raises(InputError, match=r"has shape \(1, 3\); expected \('any', 4\)"):
-        read_geometry(tmp_path, "OnceClampedBeam")
+        published_scene("OnceClampedBeam", tmp_path)
     np.save(geometry / "reference-coords.npy", np.full((4, 3), np.nan))
     with pytest.raises(InputError, match="has values that are not finite"):
-        read_geometry(tmp_path, "OnceClampedBeam")
+        published_scene("OnceClampedBeam", tmp_path)
     folder = tmp_path / "OnceClampedBeam" / "simulationData" / "test"
     folder.mkdir(parents=True)
     (folder / "theta.npy").write_bytes(b"\x93NUMPY\x01\x00")
     with pytest.raises(InputError, match=r"theta.npy is not a readable .npy array"):
-        read_tests(tmp_path, "OnceClampedBeam")
+        published_tests("OnceClampedBeam", tmp_path)
 
 
 @pytest.fixture
@@ -88,12 +86,12 @@ def test_the_twice_clamped_beam_is_read_from_a_clone(twice_clamped):
 def test_what_a_clone_lacks_is_named(twice_clamped):
     folder = twice_clamped / "data" / "TwiceClampedBeam"
     with pytest.raises(InputError, match=r"TwiceClampedBeam/simulationData/test/theta.npy is miss"):
-        read_tests(twice_clamped, "TwiceClampedBeam")
+        published_tests("TwiceClampedBeam", twice_clamped)
     (folder / "geometryData" / "elements.npy").write_text(
         "version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 46208\n"
     )
     with pytest.raises(InputError, match=r"elements.npy is a pointer to a large file .* git lfs"):
-        read_geometry(twice_clamped, "TwiceClampedBeam")
+        published_scene("TwiceClampedBeam", twice_clamped)
     (folder / "geometryData" / "elements.npy").unlink()
     with pytest.raises(InputError, match=r"elements.npy is missing; the clone lacks it"):
-        read_geometry(twice_clamped, "TwiceClampedBeam")
+        published_scene("TwiceClampedBeam", twice_clamped)

@@ -12,9 +12,9 @@ from emulator.geometry.generators.box import box
 from emulator.geometry.refinement import corner_parents, to_linear, to_quadratic
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter
-from emulator.scenes.cavities import inflated_cavity
 from emulator.scenes.effects import Onto, effects_of, leave_out
 from emulator.scenes.loads import CavityPressure, DeadPressure, FollowerPressure, Gravity, Traction
+from emulator.scenes.scene import inflated_cavity
 from emulator.scenes.supports import ElasticSupport
 from scene_support import block
 

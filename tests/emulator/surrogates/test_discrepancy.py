@@ -46,7 +46,7 @@ def test_it_meets_its_runs_and_their_sensitivities(simulator, runs, series, fitt
 
     both = sampled(fitted), sampled(lambda x: series(x) + above(x))
     largest = np.abs(runs.displacement).max()
-    given = scene.space.unit_sensitivities(runs.theta, runs.sensitivities)
+    given = runs.sensitivities * scene.space.rates(runs.theta)[..., None, None]
     for x, u, slopes in zip(scene.to_unit(runs.theta), runs.displacement, given, strict=True):
         for value, found in (field(x) for field in both):
             np.testing.assert_allclose(value, u, atol=1e-5 * largest)

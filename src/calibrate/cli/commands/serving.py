@@ -76,7 +76,7 @@ def serve(arguments: Namespace) -> Answer:
     from calibrate.um_bridge import NAME, serve
     from emulator.catalogue import find_scene
     from emulator.fem import Simulator
-    from emulator.scenes.cavities import cavity_sets
+    from emulator.scenes.scene import cavity_sets
     from emulator.surrogates.fem import fem_forward
     from emulator.surrogates.protocol import ForwardMap
 

@@ -2,15 +2,15 @@
 
 from collections.abc import Callable
 
-from emulator.scenes.built_in.beams import (
+from emulator.scenes.built_in.boxes import (
     once_clamped_beam,
     traction_beam_guccione,
     traction_beam_holzapfel_ogden,
     turned_beam,
     twice_clamped_beam,
+    twisting_cube,
 )
 from emulator.scenes.built_in.liver import liver
-from emulator.scenes.built_in.twisting_cube import twisting_cube
 from emulator.scenes.built_in.ventricles import (
     biventricle,
     left_ventricle,

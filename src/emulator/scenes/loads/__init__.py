@@ -6,7 +6,6 @@ A new kind is a frozen dataclass derived from :class:`Load` in a file of its own
 from emulator.scenes.loads.active_tension import ActiveTension
 from emulator.scenes.loads.force import Force
 from emulator.scenes.loads.gravity import Gravity, GravityVector
-from emulator.scenes.loads.load import Load
 from emulator.scenes.loads.pressure import (
     KPA_PER_MMHG,
     CavityPressure,
@@ -16,6 +15,7 @@ from emulator.scenes.loads.pressure import (
     SurfacePressure,
 )
 from emulator.scenes.loads.traction import Traction
+from emulator.scenes.part import Load
 
 LOADS: dict[str, type[Load]] = {
     load.kind: load

@@ -44,8 +44,8 @@ force on node a is
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from dataclasses import dataclass
+from typing import Any, ClassVar, override
 
 import jax
 import jax.numpy as jnp
@@ -56,8 +56,7 @@ from emulator.geometry.discretisation import Discretisation
 from emulator.geometry.mesh import Mesh, parts
 from emulator.mechanics.kinematics import cofactor, determinant
 from emulator.mechanics.laws.law import Quantity
-from emulator.scenes.loads.load import Load
-from emulator.scenes.part import LocalForce, LocalTerm, Values
+from emulator.scenes.part import Load, LocalForce, LocalTerm, Values, sums
 from emulator.scenes.tissue import Fibres
 
 
@@ -77,6 +76,7 @@ class ActiveTension(Load):
 
     kind: ClassVar[str] = "active_tension"
     magnitude: ClassVar[Quantity] = Quantity("tension", "kPa", low_admitted=True)
+    fibres: ClassVar[bool] = True
 
     tension: float | None = None
     parameter: str = "tension"
@@ -97,56 +97,27 @@ class ActiveTension(Load):
         return () if self.within is None else (self.within,)
 
     @property
-    def fibres(self) -> bool:
-        """Yes."""
-        return True
-
-    @property
     def simpler(self) -> tuple[str, None]:
         """Passive tissue."""
         return "active tension", None
 
+    @override
     def first_piola(self, F: jax.Array, mesh: Mesh, fibres: jax.Array, values: Values) -> jax.Array:
-        """Return ``F S`` (m, q, 3, 3) in kPa."""
         along = jnp.einsum("mqij,mqj,mqk->mqik", F, fibres, fibres)
         stress = self.value(values) * (along + self.transverse * (F - along))
         return stress * self._contracts(mesh)[:, None, None, None]
 
+    @override
     def term(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalTerm:
         """Return springs between nodes, or element energies where theta turns the fibres."""
-        grid, fibres = self._muscle(grid, fibres)
-        if fibres.angles:
-            return self._of_elements(grid, fibres)
-        pairs, stiffness = _springs(grid, fibres.directions, self.transverse)
-        X = grid.mesh.nodes
+        connectivity, (gradients, weights, along) = self._muscle(grid, fibres)
 
-        def energy(u: jax.Array, spring: Any, values: Values) -> jax.Array:
+        def of_spring(u: jax.Array, spring: Any, values: Values) -> jax.Array:
             stiffness, D = spring
             delta = u[1] - u[0]
             work = jnp.vdot(D, delta) + 0.5 * jnp.vdot(delta, delta)
             return self.value(values) * stiffness * work
 
-        return LocalTerm(pairs, (stiffness, X[pairs[:, 1]] - X[pairs[:, 0]]), energy, convex=True)
-
-    def _contracts(self, mesh: Mesh) -> np.ndarray:
-        """Return whether each element contracts, (m,) bool."""
-        if self.within is None:
-            return np.ones(len(mesh.elements), bool)
-        part = parts(mesh.elements, len(mesh.nodes))
-        return np.isin(part[mesh.elements[:, 0]], part[mesh.facet_set(self.within)])
-
-    def _muscle(self, grid: Discretisation, fibres: Fibres | None) -> tuple[Discretisation, Fibres]:
-        """Return the elements that contract, and their fibres."""
-        assert fibres is not None, "a scene with this load has fibres"
-        if self.within is None:
-            return grid, fibres
-        elements = np.flatnonzero(self._contracts(grid.mesh))
-        muscle = {
-            name: getattr(grid, name)[elements] for name in ("connectivity", "gradients", "weights")
-        }
-        return replace(grid, **muscle), fibres.some(elements)
-
-    def _of_elements(self, grid: Discretisation, fibres: Fibres) -> LocalTerm:
         def growth(h: jax.Array, weight: jax.Array, f: jax.Array) -> jax.Array:
             """Return the growth of the measures from rest, without cancellation for small h."""
             hf = h @ f
@@ -154,18 +125,23 @@ class ActiveTension(Load):
             everywhere = 2.0 * jnp.trace(h) + jnp.vdot(h, h)
             return weight * ((1.0 - self.transverse) * along + self.transverse * everywhere)
 
-        def energy(u: jax.Array, element: Any, values: Values) -> jax.Array:
-            gradients, weights, row = element
+        def of_element(u: jax.Array, element: Any, values: Values) -> jax.Array:
+            gradients, weights, along = element
             h = jnp.einsum("ai,qaj->qij", u, gradients)
-            work = jax.vmap(growth)(h, weights, Fibres.of_element(row, values))
+            work = jax.vmap(growth)(h, weights, along.at(values))
             return 0.5 * self.value(values) * work.sum()
 
-        data = grid.gradients, grid.weights, fibres.rows
-        return LocalTerm(grid.connectivity, data, energy, convex=True)
+        if along.angles:
+            return LocalTerm(connectivity, (gradients, weights, along), of_element, convex=True)
+        pairs, stiffness = self._springs(connectivity, gradients, weights, along.directions)
+        X = grid.mesh.nodes
+        return LocalTerm(
+            pairs, (stiffness, X[pairs[:, 1]] - X[pairs[:, 0]]), of_spring, convex=True
+        )
 
+    @override
     def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
         """Return the force of the stress on the nodes of each element."""
-        grid, fibres = self._muscle(grid, fibres)
 
         def at_point(
             w: jax.Array, gradients: jax.Array, weight: jax.Array, m: jax.Array
@@ -179,32 +155,44 @@ class ActiveTension(Load):
             return -weight * det * gradients @ stress
 
         def force(w: jax.Array, element: Any, values: Values) -> jax.Array:
-            gradients, weights, row = element
-            m = Fibres.of_element(row, values)
-            forces = jax.vmap(at_point, (None, 0, 0, 0))(w, gradients, weights, m)
+            gradients, weights, along = element
+            forces = jax.vmap(at_point, (None, 0, 0, 0))(w, gradients, weights, along.at(values))
             return self.value(values) * forces.sum(0)
 
-        return LocalForce(grid.connectivity, (grid.gradients, grid.weights, fibres.rows), force)
+        return LocalForce(*self._muscle(grid, fibres), force)
 
+    def _contracts(self, mesh: Mesh) -> np.ndarray:
+        """Return whether each element contracts, (m,) bool."""
+        if self.within is None:
+            return np.ones(len(mesh.elements), bool)
+        part = parts(mesh.elements, len(mesh.nodes))
+        return np.isin(part[mesh.elements[:, 0]], part[mesh.facet_set(self.within)])
 
-def _springs(grid: Discretisation, fibres: Any, transverse: float) -> tuple[np.ndarray, Any]:
-    """Return nodes (k, 2) and stiffness ``-k_ab`` (k,) in mm of each spring, for a tension of 1.
+    def _muscle(self, grid: Discretisation, fibres: Fibres | None) -> tuple[np.ndarray, Any]:
+        """Return nodes, and gradients, weights and fibres, of the elements that contract."""
+        assert fibres is not None, "a scene with this load has fibres"
+        muscle = grid.connectivity, (grid.gradients, grid.weights, fibres)
+        if self.within is None:
+            return muscle
+        elements = np.flatnonzero(self._contracts(grid.mesh))
+        return jax.tree.map(lambda array: array[elements], muscle)
 
-    The stiffness is a traced array where the grid is traced, else a NumPy array.
-    """
-    gradients, weights = grid.gradients, grid.weights
-    traced = any(isinstance(a, jax.core.Tracer) for a in (gradients, weights, fibres))
-    xp: Any = jnp if traced else np
-    along = xp.einsum("mqai,mqi->mqa", gradients, fibres)
-    stiffness = (1.0 - transverse) * xp.einsum("mq,mqa,mqb->mab", weights, along, along)
-    if transverse:
-        stiffness += transverse * xp.einsum(
-            "mq,mqai,mqbi->mab", weights, gradients, gradients, optimize=True
-        )
-    one, other = np.triu_indices(grid.connectivity.shape[1], 1)
-    ends = np.sort(grid.connectivity[:, np.stack([one, other], axis=1)], axis=2).reshape(-1, 2)
-    pairs, spring_of_pair = np.unique(ends, axis=0, return_inverse=True)
-    amounts = stiffness[:, one, other].ravel()
-    if traced:
-        return pairs, -jax.ops.segment_sum(amounts, spring_of_pair.ravel(), len(pairs))
-    return pairs, -np.bincount(spring_of_pair.ravel(), amounts, minlength=len(pairs))
+    def _springs(
+        self, connectivity: np.ndarray, gradients: Any, weights: Any, fibres: Any
+    ) -> tuple[np.ndarray, Any]:
+        """Return nodes (k, 2) and stiffness ``-k_ab`` (k,) in mm of springs, for a tension of 1.
+
+        The stiffness is a traced array where the grid is traced, else a NumPy array.
+        """
+        traced = any(isinstance(a, jax.core.Tracer) for a in (gradients, weights, fibres))
+        xp: Any = jnp if traced else np
+        along = xp.einsum("mqai,mqi->mqa", gradients, fibres)
+        stiffness = (1.0 - self.transverse) * xp.einsum("mq,mqa,mqb->mab", weights, along, along)
+        if self.transverse:
+            stiffness += self.transverse * xp.einsum(
+                "mq,mqai,mqbi->mab", weights, gradients, gradients, optimize=True
+            )
+        one, other = np.triu_indices(connectivity.shape[1], 1)
+        ends = np.sort(connectivity[:, np.stack([one, other], axis=1)], axis=2).reshape(-1, 2)
+        pairs, spring_of_pair = np.unique(ends, axis=0, return_inverse=True)
+        return pairs, -sums(len(pairs), spring_of_pair, stiffness[:, one, other])

@@ -18,8 +18,7 @@ import numpy as np
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import Discretisation
 from emulator.geometry.mesh import EDGES, Mesh
-from emulator.scenes.loads.load import Load
-from emulator.scenes.part import LocalForce, Values
+from emulator.scenes.part import Load, LocalForce, Values
 from emulator.scenes.tissue import Fibres
 
 MN_PER_N = 1e3
@@ -55,11 +54,6 @@ class Force(Load):
         return f"force on '{self.node_set}'", None
 
     @override
-    def check(self, mesh: Mesh, prescribed: np.ndarray, displacement: np.ndarray) -> None:
-        """Refuse a node set that the mesh does not have."""
-        mesh.node_set(self.node_set)
-
-    @override
     def dead_forces(self, grid: Discretisation) -> Mapping[str | None, np.ndarray]:
         return {self.amount: self._spread(grid.mesh)}
 
@@ -89,9 +83,8 @@ def edges_between(mesh: Mesh, nodes: np.ndarray) -> np.ndarray:
     """Return the edges (e, 2), quadratic (e, 3), whose nodes are all among ``nodes`` (k,)."""
     among = np.zeros(len(mesh.nodes), dtype=bool)
     among[nodes] = True
-    quadratic = mesh.order == 2
-    local = [(a, b, 4 + k) if quadratic else (a, b) for k, (a, b) in enumerate(EDGES)]
-    edges = mesh.elements[:, local].reshape(-1, len(local[0]))
+    local = [(a, b, 4 + k)[: mesh.order + 1] for k, (a, b) in enumerate(EDGES)]
+    edges = mesh.elements[:, local].reshape(-1, mesh.order + 1)
     edges = edges[among[edges].all(axis=1)]
     edges[:, :2] = np.sort(edges[:, :2], axis=1)
     return np.unique(edges, axis=0)

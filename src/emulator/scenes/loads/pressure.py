@@ -34,7 +34,7 @@ With the normals of the facets pointing out of the tissue and :math:`x = X + u`:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, override
 
 import jax
@@ -43,12 +43,11 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import Discretisation, FacetRule, facet_rule
-from emulator.geometry.facets import area_vectors, cone_volume, nodal_area_vectors, rim
+from emulator.geometry.facets import cone_volume, nodal_area_vectors, rim
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.kinematics import cofactor
 from emulator.mechanics.laws.law import Quantity
-from emulator.scenes.loads.load import Load, nodal_sums
-from emulator.scenes.part import LocalForce, LocalTerm, Values
+from emulator.scenes.part import Load, LocalForce, LocalTerm, Prescribed, Values, sums
 from emulator.scenes.tissue import Fibres
 
 KPA_PER_MMHG = 0.133322
@@ -82,11 +81,6 @@ class SurfacePressure(Load):
         """The facet set it acts on."""
         return self.facet_set
 
-    def _dead(self) -> tuple[str, DeadPressure]:
-        """Return the effect that the pressure follows the surface, and the pressure without it."""
-        dead = DeadPressure(self.facet_set, self.pressure, self.parameter)
-        return f"pressure that follows '{self.facet_set}'", dead
-
     def _facets(self, grid: Discretisation) -> tuple[np.ndarray, np.ndarray, FacetRule]:
         """Return facets (k, a), their nodes (k, a, 3), and a rule for N_a times an area vector."""
         mesh = grid.mesh
@@ -104,47 +98,40 @@ class DeadPressure(SurfacePressure):
     @override
     def dead_forces(self, grid: Discretisation) -> Mapping[str | None, np.ndarray]:
         facets, corners, rule = self._facets(grid)
-        areas = -nodal_area_vectors(corners, rule)
+        areas, count = -nodal_area_vectors(corners, rule), len(grid.mesh.nodes)
         xp = areas.__array_namespace__()
-        per_kpa = xp.stack([nodal_sums(grid.mesh, facets, areas[..., i]) for i in range(3)], axis=1)
+        per_kpa = xp.stack([sums(count, facets, areas[..., i]) for i in range(3)], axis=1)
         known = self.pressure
         return {self.parameter: per_kpa} if known is None else {None: known * per_kpa}
 
     @override
     def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
-        facets, corners, rule = self._facets(grid)
-
-        def force(w: jax.Array, corners: jax.Array, values: Values) -> jax.Array:
-            return -self.value(values) * nodal_area_vectors(corners + w, rule)
-
-        return LocalForce(facets, corners, force)
+        # The surface at rest is x + w: as a pressure that follows w.
+        return FollowerPressure(**vars(self)).force(grid)
 
 
-@dataclass(frozen=True)
-class FollowerPressure(SurfacePressure):
-    """Pressure on a patch whose rim may move; positive pushes into the tissue."""
-
-    kind: ClassVar[str] = "follower_pressure"
+class FollowingPressure(SurfacePressure):
+    """A pressure that follows the surface."""
 
     @property
     def simpler(self) -> tuple[str, DeadPressure]:
-        """The pressure on the patch as it is at rest."""
-        return self._dead()
+        """The pressure on the surface as it is at rest."""
+        return f"pressure that follows '{self.facet_set}'", DeadPressure(**vars(self))
 
-    @property
-    def has_potential(self) -> bool:
-        """No: the tangent of the force is not symmetric."""
-        return False
+
+@dataclass(frozen=True)
+class FollowerPressure(FollowingPressure):
+    """Pressure on a patch whose rim may move; positive pushes into the tissue."""
+
+    kind: ClassVar[str] = "follower_pressure"
+    has_potential: ClassVar[bool] = False
 
     @override
     def force(self, grid: Discretisation) -> LocalForce:
         facets, corners, rule = self._facets(grid)
 
         def force(u: jax.Array, corners: jax.Array, values: Values) -> jax.Array:
-            normals = area_vectors(corners + u, rule)
-            return -self.value(values) * jnp.einsum(
-                "q,qa,qi->ai", rule.weights, rule.values, normals
-            )
+            return -self.value(values) * nodal_area_vectors(corners + u, rule)
 
         return LocalForce(facets, corners, force)
 
@@ -155,31 +142,27 @@ class FollowerPressure(SurfacePressure):
         def force(w: jax.Array, corners: jax.Array, values: Values) -> jax.Array:
             return following.force(jnp.zeros_like(w), corners, values)
 
-        return LocalForce(following.nodes, following.data, force)
+        return replace(following, force=force)
 
 
 @dataclass(frozen=True)
-class CavityPressure(SurfacePressure):
+class CavityPressure(FollowingPressure):
     """Pressure in a cavity, exact (``-p V``); the rim of its wall must be held."""
 
     kind: ClassVar[str] = "cavity_pressure"
 
     @property
-    def simpler(self) -> tuple[str, DeadPressure]:
-        """The pressure on the wall as it is at rest."""
-        return self._dead()
-
-    @property
     def at_held_nodes(self) -> FollowerPressure:
         """The pressure on the wall alone: the part of the lid in ``V`` acts on the fixed rim."""
-        return FollowerPressure(self.facet_set, self.pressure, self.parameter)
+        return FollowerPressure(**vars(self))
 
     @override
-    def check(self, mesh: Mesh, prescribed: np.ndarray, displacement: np.ndarray) -> None:
+    def check(self, mesh: Mesh, prescribed: Prescribed) -> None:
         """Refuse a cavity whose rim is neither fixed nor slides in a plane through the origin."""
         edges = rim(mesh.facet_set(self.facet_set))
-        fixed = prescribed[edges]  # (e, 2 or 3, 3)
-        positions = np.where(fixed, mesh.nodes[edges] + displacement[edges], np.nan)
+        fixed = prescribed.held[edges]  # (e, 2 or 3, 3)
+        largest = sum(map(np.abs, (prescribed.displacement, *prescribed.per_unit.values())))
+        positions = np.where(fixed, mesh.nodes[edges] + largest[edges], np.nan)
         in_symmetry_plane = (np.abs(positions) <= 1e-9 * mesh.size).all(axis=1).any(axis=1)
         loose = np.unique(edges[~(fixed.all(axis=(1, 2)) | in_symmetry_plane)])
         if loose.size:
@@ -209,7 +192,7 @@ class PublishedPressure(SurfacePressure):
     kind: ClassVar[str] = "published_pressure"
 
     @override
-    def check(self, mesh: Mesh, prescribed: np.ndarray, displacement: np.ndarray) -> None:
+    def check(self, mesh: Mesh, prescribed: Prescribed) -> None:
         """Refuse quadratic tetrahedra, on which the released work is not defined."""
         if mesh.order != 1:
             raise InputError(

@@ -12,8 +12,7 @@ import numpy as np
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import Discretisation, facet_rule
 from emulator.geometry.facets import nodal_areas
-from emulator.scenes.loads.load import Load, nodal_sums
-from emulator.scenes.part import LocalForce, Values
+from emulator.scenes.part import Load, LocalForce, Values, sums
 from emulator.scenes.tissue import Fibres
 
 
@@ -42,9 +41,9 @@ class Traction(Load):
 
     @override
     def dead_forces(self, grid: Discretisation) -> Mapping[str | None, np.ndarray]:
-        mesh = grid.mesh
-        facets = mesh.facet_set(self.facet_set)
-        area = nodal_sums(mesh, facets, nodal_areas(mesh.nodes[facets], facet_rule(mesh.order, 4)))
+        mesh, facets = grid.mesh, grid.mesh.facet_set(self.facet_set)
+        areas = nodal_areas(mesh.nodes[facets], facet_rule(mesh.order, 4))
+        area = sums(len(mesh.nodes), facets, areas)
         return {None: area[:, None] * np.asarray(self.traction, dtype=float)}
 
     @override

@@ -1,6 +1,6 @@
 """Supports, one kind a file; ``SUPPORTS`` is their registry."""
 
-from emulator.scenes.supports.boundary_condition import BoundaryCondition
+from emulator.scenes.part import BoundaryCondition
 from emulator.scenes.supports.dirichlet import Support
 from emulator.scenes.supports.elastic import ElasticSupport
 

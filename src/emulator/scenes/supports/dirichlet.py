@@ -4,7 +4,7 @@ r"""Prescribed displacements: fixed ones, and ones whose amount is a parameter.
 
 at prescribed components, with the fixed displacement :math:`\bar u` in mm and the displacement
 :math:`d_k` in mm per unit of the amount :math:`\theta_k`, such as the amount of shear of a cube
-between plates.
+between plates. All supports of a scene together leave no rigid motion of the body free.
 """
 
 from __future__ import annotations
@@ -12,16 +12,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import ClassVar, NamedTuple, override
+from typing import ClassVar, override
 
-import jax
-import jax.numpy as jnp
 import numpy as np
+from scipy.spatial import cKDTree
 
 from emulator.core.errors import InputError
-from emulator.geometry.mesh import Mesh, frozen_array
-from emulator.scenes.part import Values
-from emulator.scenes.supports.boundary_condition import BoundaryCondition, Held, Resisted
+from emulator.geometry.mesh import Mesh, frozen_array, parts
+from emulator.scenes.part import BoundaryCondition, Held, Prescribed
 
 _AXES = "xyz"
 
@@ -80,35 +78,10 @@ class Support(BoundaryCondition):
         return replace(self, displacement=displacements[self.amount][mesh.node_set(self.node_set)])
 
     @override
-    def resisted(self, mesh: Mesh) -> Resisted:
+    def resisted(self, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
         _, nodes, _, axes, _ = self.held(mesh)
         points = np.repeat(mesh.nodes[nodes], len(axes), axis=0)
-        return Resisted(points, np.tile(np.eye(3)[axes], (len(nodes), 1)))
-
-
-class Prescribed(NamedTuple):
-    """The displacements that all supports of a scene prescribe.
-
-    held : (n, 3) bool, the components that are prescribed.
-    displacement : their fixed part, (n, 3) mm, zero elsewhere.
-    per_unit : (n, 3) mm per unit of a parameter, by the parameter's name.
-    """
-
-    held: np.ndarray
-    displacement: np.ndarray
-    per_unit: Mapping[str, np.ndarray]
-
-    @property
-    def moves(self) -> bool:
-        """Whether any prescribed displacement differs from zero."""
-        return bool(self.displacement.any()) or bool(self.per_unit)
-
-    def at(self, values: Values, rows: slice | np.ndarray = slice(None)) -> jax.Array:
-        """Return the displacement (..., k, 3) mm of nodes ``rows`` at amounts ``values`` (...)."""
-        u = jnp.asarray(self.displacement[rows])
-        for name, per_unit in self.per_unit.items():
-            u = u + jnp.asarray(values[name])[..., None, None] * per_unit[rows]
-        return u
+        return points, np.tile(np.eye(3)[axes], (len(nodes), 1))
 
 
 def prescribe(mesh: Mesh, supports: Sequence[BoundaryCondition]) -> Prescribed:
@@ -140,3 +113,42 @@ def prescribe(mesh: Mesh, supports: Sequence[BoundaryCondition]) -> Prescribed:
     fixed = frozen_array(totals.pop(None))
     per_unit = {str(name): frozen_array(total) for name, total in totals.items() if total.any()}
     return Prescribed(frozen_array(components, bool), fixed, MappingProxyType(per_unit))
+
+
+def check_motions(mesh: Mesh, supports: Sequence[BoundaryCondition]) -> None:
+    """Refuse supports that let a connected part of the body move or turn."""
+    resisted = [support.resisted(mesh) for support in supports]
+    points, directions = map(np.concatenate, zip(*resisted, strict=True))
+    part = parts(mesh.elements, len(mesh.nodes))
+    owner = part[cKDTree(mesh.nodes).query(points)[1]]
+    for k in range(part.max() + 1):
+        free = _free_motions(points[owner == k], directions[owner == k])
+        if not free:
+            continue
+        who = "its supports leave"
+        if part.any():
+            inside = mesh.nodes[part == k]
+            x, y, z = inside.mean(axis=0)
+            who = (
+                f"the mesh has {part.max() + 1} parts, and supports leave the one of "
+                f"{len(inside)} nodes about ({x:.3g}, {y:.3g}, {z:.3g}) mm"
+            )
+        raise InputError(
+            f"{who} {free} of the 6 rigid motions free, the body could move "
+            "or turn; hold more nodes or components"
+        )
+
+
+def _free_motions(points: np.ndarray, directions: np.ndarray) -> int:
+    """Return how many rigid motions ``points`` (k, 3), fixed along ``directions`` (k, 3), leave.
+
+    A small rigid motion ``a + w x X`` moves a point along its direction by ``a . d + w . (X x d)``;
+    the rank of these rows is the number of motions that are resisted.
+    """
+    if not len(points):
+        return 6
+    centred = points - points.mean(axis=0)
+    size = np.linalg.norm(np.ptp(points, axis=0))
+    unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    rows = np.hstack([unit, np.cross(centred, unit) / (size if size > 0.0 else 1.0)])
+    return 6 - int(np.linalg.matrix_rank(rows.T @ rows, tol=1e-12 * len(rows), hermitian=True))

@@ -9,8 +9,8 @@ that gives is such a support whose stiffness is inferred.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar, Literal, override
 
 import jax
@@ -22,8 +22,7 @@ from emulator.geometry.discretisation import Discretisation, FacetRule, facet_ru
 from emulator.geometry.facets import area_vectors
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws.law import Quantity
-from emulator.scenes.part import LocalForce, LocalTerm, Values
-from emulator.scenes.supports.boundary_condition import BoundaryCondition, Resisted
+from emulator.scenes.part import BoundaryCondition, LocalForce, LocalTerm, Values
 
 
 @dataclass(frozen=True)
@@ -73,44 +72,43 @@ class ElasticSupport(BoundaryCondition):
     @override
     def term(self, grid: Discretisation) -> LocalTerm:
         """Return the energy of the springs, facet by facet."""
-        mesh = grid.mesh
-        facets = mesh.facet_set(self.facet_set)
-        rule = facet_rule(mesh.order, 2 * mesh.order)  # the degree of |u|^2
-        normals = area_vectors(mesh.nodes[facets], rule)  # (k, q, 3)
-        return LocalTerm(facets, normals, self._energy(rule))
+        facets, corners, rule = self._facets(grid.mesh)
+        return LocalTerm(facets, area_vectors(corners, rule), partial(self._energy, rule))
 
     @override
     def on_loaded(self, grid: Discretisation) -> LocalForce:
         """Return the force of springs at rest with the body, on the surface at rest, ``x + w``."""
-        mesh = grid.mesh
-        facets, rule = mesh.facet_set(self.facet_set), facet_rule(mesh.order, 2 * mesh.order)
-        energy = self._energy(rule)
+        facets, corners, rule = self._facets(grid.mesh)
 
         def force(w: jax.Array, corners: jax.Array, values: Values) -> jax.Array:
-            return -jax.grad(energy)(-w, area_vectors(corners + w, rule), values)
+            normals = area_vectors(corners + w, rule)
+            return -jax.grad(partial(self._energy, rule))(-w, normals, values)
 
-        return LocalForce(facets, mesh.nodes[facets], force)
+        return LocalForce(facets, corners, force)
 
-    def _energy(self, rule: FacetRule) -> Callable[[jax.Array, jax.Array, Values], jax.Array]:
-        """Return the energy () in mN mm of a facet with area vectors (q, 3) at rest."""
+    def _facets(self, mesh: Mesh) -> tuple[np.ndarray, np.ndarray, FacetRule]:
+        """Return facets (k, a), their nodes (k, a, 3), and a rule for the degree of ``|u|^2``."""
+        facets = mesh.facet_set(self.facet_set)
+        return facets, mesh.nodes[facets], facet_rule(mesh.order, 2 * mesh.order)
 
-        def energy(u: jax.Array, normals: jax.Array, values: Values) -> jax.Array:
-            areas = jnp.sqrt(jnp.sum(normals**2, axis=1))
-            at_points = rule.values @ u
-            if self.direction == "normal":
-                squared = (jnp.sum(at_points * normals, axis=1) / areas) ** 2
-            else:
-                squared = jnp.sum(at_points**2, axis=1)
-            return 0.5 * self.value(values) * jnp.sum(rule.weights * areas * squared)
-
-        return energy
+    def _energy(
+        self, rule: FacetRule, u: jax.Array, normals: jax.Array, values: Values
+    ) -> jax.Array:
+        """Return the energy () in mN mm of a facet with area vectors ``normals`` (q, 3) at rest."""
+        areas = jnp.sqrt(jnp.sum(normals**2, axis=1))
+        at_points = rule.values @ u
+        if self.direction == "normal":
+            squared = (jnp.sum(at_points * normals, axis=1) / areas) ** 2
+        else:
+            squared = jnp.sum(at_points**2, axis=1)
+        return 0.5 * self.value(values) * jnp.sum(rule.weights * areas * squared)
 
     @override
-    def resisted(self, mesh: Mesh) -> Resisted:
+    def resisted(self, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
         """Return the corners of every facet, along all axes or along the facet's normal."""
         points = mesh.nodes[mesh.facet_set(self.facet_set)][:, :3]
         normal = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
         if self.direction == "normal":
-            return Resisted(points.reshape(-1, 3), np.repeat(normal, 3, axis=0))
+            return points.reshape(-1, 3), np.repeat(normal, 3, axis=0)
         every = points.reshape(-1, 3)
-        return Resisted(np.repeat(every, 3, axis=0), np.tile(np.eye(3), (len(every), 1)))
+        return np.repeat(every, 3, axis=0), np.tile(np.eye(3), (len(every), 1))

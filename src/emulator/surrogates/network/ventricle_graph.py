@@ -15,8 +15,7 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.geometry.heart_wall import Ventricle, ventricle
-from emulator.scenes.cavities import find_cavity
-from emulator.scenes.scene import Scene
+from emulator.scenes.scene import Scene, find_cavity
 from emulator.surrogates.network.graph import hierarchy, mesh_edges
 
 _NEAREST = 1e-3  # least distance over L in a logarithm

@@ -44,7 +44,7 @@ def test_sensitivities_against_differences(simulator, thetas):
     uniform = replace(scene.parameters[1], scale="uniform")
     mixed = em.Simulator(replace(scene, parameters=(scene.parameters[0], uniform)))
     runs = run_campaign(mixed, thetas[:2], sensitivities=True)
-    in_box = mixed.scene.space.unit_sensitivities(runs.theta, runs.sensitivities)
+    in_box = runs.sensitivities * mixed.scene.space.rates(runs.theta)[..., None, None]
     theta, position = runs.theta[1], mixed.scene.to_unit(runs.theta)[1]
     for k in range(2):
         for found, at, solve in (

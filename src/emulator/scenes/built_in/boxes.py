@@ -1,4 +1,7 @@
-"""Beams under gravity, and fibrous beams under traction (Dalton et al. 2023, 3.1, Appendix A)."""
+"""Beams and a twisted cube (Dalton et al. 2023, Sections 3.1 and 3.2, Appendix A).
+
+Beams bend under gravity; fibrous ones under traction.
+"""
 
 from __future__ import annotations
 
@@ -22,10 +25,7 @@ Cells = tuple[int, int, int]
 
 _G = 9.80  # m/s2, as published
 _BEAM = (100.0, 10.0, 10.0)  # mm, as published
-_SIZES = {
-    1: {"cells": (12, 4, 5), "grading": 1.0},
-    2: {"cells": (20, 2, 2), "grading": 1.5},
-}
+_SIZES = {1: {"cells": (12, 4, 5), "grading": 1.0}, 2: {"cells": (20, 2, 2), "grading": 1.5}}
 # Stiff fibres along a beam that bends need more cells through the height.
 _FIBROUS_SIZES = {1: _SIZES[1], 2: {"cells": (14, 2, 5), "grading": 2.0}}
 
@@ -93,10 +93,8 @@ def traction_beam_holzapfel_ogden(
     kappa : resistance to volume change, kPa.
     order, grading : of the elements, as in :func:`once_clamped_beam`.
     """
-    mesh, sizes = _mesh(cells, order, grading, ("left",), _FIBROUS_SIZES)
-    origin = {**sizes, "traction": traction, "fibre_angle": fibre_angle, "kappa": kappa}
-    name = "traction_beam_holzapfel_ogden"
-    return _traction_beam(name, "holzapfel_ogden", MYOCARDIUM, mesh, origin)
+    origin = {"traction": traction, "fibre_angle": fibre_angle, "kappa": kappa}
+    return _traction_beam("holzapfel_ogden", MYOCARDIUM, cells, order, grading, origin)
 
 
 def traction_beam_guccione(
@@ -124,10 +122,8 @@ def traction_beam_guccione(
         Parameter("b_t", "", 1.0, 4.0, "log"),
         Parameter("b_fs", "", 2.0, 8.0, "log"),
     )
-    mesh, sizes = _mesh(cells, order, grading, ("left",), _FIBROUS_SIZES)
-    origin = {**sizes, "traction": traction, "fibre_angle": fibre_angle, "kappa": kappa}
-    name = "traction_beam_guccione"
-    return _traction_beam(name, "guccione", parameters, mesh, origin)
+    origin = {"traction": traction, "fibre_angle": fibre_angle, "kappa": kappa}
+    return _traction_beam("guccione", parameters, cells, order, grading, origin)
 
 
 def _gravity_beam(
@@ -149,13 +145,15 @@ def _gravity_beam(
 
 
 def _traction_beam(
-    name: str,
     law: str,
     parameters: tuple[Parameter, ...],
-    mesh: Mesh,
-    origin: dict[str, Any],
+    cells: Cells | None,
+    order: int,
+    grading: float | None,
+    origin: dict[str, float],
 ) -> Scene:
-    angle = np.radians(origin["fibre_angle"])
+    mesh, sizes = _mesh(cells, order, grading, ("left",), _FIBROUS_SIZES)
+    angle, name = np.radians(origin["fibre_angle"]), f"traction_beam_{law}"
     return Scene(
         name=name,
         mesh=mesh,
@@ -165,7 +163,7 @@ def _traction_beam(
         supports=(Support("left"),),
         constants={"kappa": origin["kappa"]},
         fibres=np.tile([np.cos(angle), np.sin(angle), 0.0], (len(mesh.elements), 1)),
-        origin={"scene": name, **origin},
+        origin={"scene": name, **sizes, **origin},
     )
 
 
@@ -184,3 +182,50 @@ def _mesh(
     sizes = resolved(defaults, order, cells=cells, grading=grading)
     along = toward_ends(sizes["cells"][0], sizes["grading"], clamped)
     return box(_BEAM, sizes["cells"], order, along), {**sizes, "cells": list(sizes["cells"])}
+
+
+def twisting_cube(
+    cells: int | None = None, edge: float = 10.0, degrees: float = 60.0, order: int = 2
+) -> Scene:
+    """A cube clamped at its left face, its right face twisted about the x axis.
+
+    Each point of the right face moves halfway along the chord of a rigid rotation by ``degrees``,
+    as published. theta = (E, nu), 1 to 25 kPa, 0.1 to 0.4.
+
+    Parameters
+    ----------
+    cells : the number of cells along each edge; the default depends on the order.
+    edge : the length of an edge, mm.
+    degrees : the angle of the rotation whose half chord is prescribed.
+    order : the order of the elements; 1 as published.
+    """
+    count = resolved({1: {"cells": 6}, 2: {"cells": 4}}, order, cells=cells)["cells"]
+    sizes = {"cells": count, "edge": edge, "degrees": degrees, "order": order}
+    mesh = box((edge,) * 3, (count,) * 3, order)
+    right = mesh.nodes[mesh.node_set("right")]
+    displacement = 0.5 * twist(right, np.full(3, edge / 2.0), degrees)
+    return Scene(
+        name="twisting_cube",
+        mesh=mesh,
+        law=find_law("neo_hookean_E_nu"),
+        parameters=(Parameter("E", "kPa", 1.0, 25.0, "log"), Parameter("nu", "", 0.1, 0.4, "log")),
+        supports=(Support("left"), Support("right", displacement)),
+        origin={"scene": "twisting_cube", **sizes},
+    )
+
+
+def twist(points: np.ndarray, centre: np.ndarray, degrees: float) -> np.ndarray:
+    """Return the displacement (k, 3) of a rigid rotation of ``points`` (k, 3).
+
+    Parameters
+    ----------
+    points : the coordinates (k, 3) in mm.
+    centre : a point (3,) on the axis of rotation, which is parallel to x.
+    degrees : the angle of rotation.
+    """
+    angle = np.deg2rad(degrees)
+    rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    displacement = np.zeros_like(points)
+    arm = points[:, 1:] - centre[1:]
+    displacement[:, 1:] = arm @ rotation.T - arm
+    return displacement
