@@ -101,7 +101,32 @@ def likelihood() -> list[Frame]:
     return journey(Model, "distributions", infer)
 
 
+SCENE = """law = "neo_hookean"
+mesh = "block.vtu"
+supports = [{node_set = "left"}]
+loads = [{kind = "gravity"}]
+constants = {lam = 30.0}
+parameters = {mu = {unit = "kPa", range = [5.0, 20.0]}}
+"""
+
+
+def scene_file() -> list[Frame]:
+    """Return the frames from ``calibrate simulate file.toml`` to the construction of its scene."""
+    from calibrate.cli import main
+    from emulator.geometry.generators.box import box
+    from emulator.geometry.io import write_mesh
+    from emulator.scenes import Scene
+
+    with TemporaryDirectory() as folder:
+        write_mesh(f"{folder}/block.vtu", box((2.0, 1.0, 1.0), (2, 1, 1)))
+        file = Path(folder) / "file.toml"
+        file.write_text(SCENE)
+        words = ["--no-cache", "simulate", str(file)]
+        return journey(Scene, "__post_init__", lambda: main(words))
+
+
 JOURNEYS: dict[str, Callable[[], list[Frame]]] = {
+    "scene TOML to Scene": scene_file,
     "Simulator.solve to law.energy": solve,
     "calibrate infer to the data file": parse,
     "calibrate infer to the likelihood": likelihood,

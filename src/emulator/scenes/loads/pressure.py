@@ -161,7 +161,8 @@ class CavityPressure(FollowingPressure):
         """Refuse a cavity whose rim is neither fixed nor slides in a plane through the origin."""
         edges = rim(mesh.facet_set(self.facet_set))
         fixed = prescribed.held[edges]  # (e, 2 or 3, 3)
-        largest = sum(map(np.abs, (prescribed.displacement, *prescribed.per_unit.values())))
+        _, displacement, per_unit = prescribed
+        largest = sum(map(np.abs, per_unit.values()), np.abs(displacement))
         positions = np.where(fixed, mesh.nodes[edges] + largest[edges], np.nan)
         in_symmetry_plane = (np.abs(positions) <= 1e-9 * mesh.size).all(axis=1).any(axis=1)
         loose = np.unique(edges[~(fixed.all(axis=(1, 2)) | in_symmetry_plane)])
