@@ -134,10 +134,11 @@ class Part(ABC):
         Numbers are floats, -0.0 is 0.0, and the entries of a tuple stand one by one. The name of
         the parameter is None where the magnitude is a number.
         """
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        if self.known is not None:
+            values["parameter"] = None
         entries: list[Any] = [self.kind]
-        for each in fields(self):
-            unused = each.name == "parameter" and self.known is not None
-            value = None if unused else getattr(self, each.name)
+        for value in values.values():
             for entry in value if isinstance(value, tuple) else (value,):
                 numeric = isinstance(entry, int | float) and not isinstance(entry, bool)
                 entries.append(float(entry) + 0.0 if numeric else entry)

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import journeys
 from emulator.catalogue import find_scene, scene_from_origin
 from emulator.core.errors import InputError
 from emulator.geometry.fibres import (
@@ -27,6 +28,12 @@ from emulator.scenes.loads import (
 )
 from emulator.scenes.supports import ElasticSupport
 from scene_file_support import HEART, SCENE
+
+
+def test_few_frames_lie_between_a_command_and_its_scene():
+    frames = journeys.scene_file()
+    assert len(frames) <= 6
+    assert frames[-1].function == "SceneData.__post_init__"
 
 
 def test_a_scene_from_a_file(folder):
