@@ -23,6 +23,7 @@ from functools import cached_property
 from itertools import islice
 from typing import Any, cast
 
+import jax
 import numpy as np
 
 from emulator.core.errors import InputError, SolverError
@@ -53,7 +54,7 @@ class Cluster:
 
     client: Client
     address: str
-    _names: dict[Solver, str] = field(default_factory=dict)
+    names: dict[Solver, str] = field(default_factory=dict)  # of the solvers that workers know
 
     def __call__(self, solver: Solver, tasks: Iterator[Task]) -> Iterator[Row]:
         """Yield rows in the order in which they come back.
@@ -68,11 +69,11 @@ class Cluster:
 
     def _name(self, solver: Solver) -> str:
         """Return the name by which workers know ``solver``; send it to them once."""
-        if solver not in self._names:
+        if solver not in self.names:
             name = f"campaign-{uuid.uuid4().hex}"
             self.client.register_plugin(SolverPlugin(solver), name=name)
-            self._names[solver] = name
-        return self._names[solver]
+            self.names[solver] = name
+        return self.names[solver]
 
     def _rows(self, name: str, tasks: Iterator[Task]) -> Iterator[Row]:
         pending: dict[Future, int] = {}
@@ -80,11 +81,13 @@ class Cluster:
         while True:
             room = max(0, _TASKS_A_WORKER * self._workers() - len(pending))
             for task in islice(tasks, room):
-                future = self.client.submit(_solve, name, _as_numpy(task), pure=False)
-                pending[future] = task.number
+                arrays = jax.tree.map(np.asarray, task)._replace(number=task.number)
+                pending[self.client.submit(_solve, name, arrays, pure=False)] = task.number
             if not pending:
                 break
-            for future in self._wait_for_any(pending):
+            with suppress(TimeoutError), self.client.as_current():
+                wait(list(pending), timeout=_POLL_S, return_when="FIRST_COMPLETED")
+            for future in [each for each in pending if each.done()]:
                 try:
                     row = future.result(timeout=_POLL_S)
                 except TimeoutError:  # the worker was lost; Dask solves the task again
@@ -115,28 +118,9 @@ class Cluster:
             f"campaign: the scheduler {self.address} has had no worker for {WORKERS_S:g} s"
         )
 
-    def _wait_for_any(self, pending: dict[Future, int]) -> list[Future]:
-        """Wait until a future is done, checking that there are workers; return all that are."""
-        while True:
-            try:
-                with self.client.as_current():
-                    wait(list(pending), timeout=_POLL_S, return_when="FIRST_COMPLETED")
-            except TimeoutError:
-                self._workers()
-            completed = [future for future in pending if future.done()]
-            if completed:
-                return completed
-
     def _connection_error(self, error: Exception) -> SolverError:
         message = " ".join(str(error).split())
         return SolverError(f"campaign: the scheduler {self.address} does not answer ({message})")
-
-    def forget(self) -> None:
-        """Let the workers that are still there forget the solvers."""
-        for name in self._names.values():
-            with suppress(OSError, CancelledError, RuntimeError, ValueError, KeyError):
-                self.client.unregister_worker_plugin(name)
-        self._names.clear()
 
 
 @contextmanager
@@ -156,7 +140,9 @@ def connected(address: str) -> Iterator[Cluster]:
     try:
         yield cluster
     finally:
-        cluster.forget()
+        for name in cluster.names.values():  # workers that are still there forget the solvers
+            with suppress(OSError, CancelledError, RuntimeError, ValueError, KeyError):
+                client.unregister_worker_plugin(name)
         client.close()
 
 
@@ -198,8 +184,3 @@ class SolverPlugin(WorkerPlugin):
 def _solve(name: str, task: Task) -> Row:
     """Solve a task; a worker runs this."""
     return cast(SolverPlugin, get_worker().plugins[name]).solve(task)
-
-
-def _as_numpy(task: Task) -> Task:
-    starts = tuple(np.asarray(start) for start in task.starts)
-    return Task(task.number, np.asarray(task.theta), starts)
