@@ -25,7 +25,6 @@ from emulator.surrogates.taylor import constant
 from emulator.training.network_plan import NetworkPlan, Problem, architecture_of, untrained
 from emulator.training.objectives import (
     OBJECTIVES,
-    Batch,
     Objective,
     component_scales,
     loss_scales,
@@ -140,14 +139,13 @@ def batch_training(
     scales = loss_scales(scene, runs, from_runs=plan.learns_from_runs)
     loss = make_loss(scene, plan.objective, scales, plan.energy_weight)
 
-    def draw(number: jax.Array) -> Batch:
+    def draw(number: jax.Array) -> Runs:
         """Return the batch of a step, which follows from its number."""
         key = jax.random.fold_in(jax.random.key(plan.seed), number)
         if not plan.learns_from_runs:
-            nothing = jnp.zeros(0)
-            return Batch(uniform(scene, plan.batch, key), nothing, nothing)
+            return Runs(uniform(scene, plan.batch, key), jnp.zeros(0), jnp.zeros(0))
         rows = jax.random.choice(key, len(runs.theta), (plan.batch,), replace=False)
-        return Batch(runs.theta[rows], runs.displacement[rows], runs.energy[rows])
+        return runs._replace(sensitivities=None).take(rows)
 
     def descend(
         weights: Weights, number: jax.Array, *frozen: jax.Array

@@ -36,18 +36,6 @@ OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
 _GUESSED_SD = 0.2
 
 
-class Batch(NamedTuple):
-    """The theta of a step and their FEM solutions.
-
-    theta : (b, p). displacement : (b, n, 3) mm. energy : (b,) mN mm. FEM arrays are empty for the
-    objective ``energy``.
-    """
-
-    theta: jax.Array
-    displacement: jax.Array
-    energy: jax.Array
-
-
 class Scales(NamedTuple):
     """Divisors that make each term dimensionless and of order 1.
 
@@ -61,25 +49,25 @@ class Scales(NamedTuple):
 
 def make_loss(
     scene: Scene, objective: Objective, scales: Scales, weight: float
-) -> Callable[[jax.Array, Batch], jax.Array]:
-    """Return ``loss(u, batch)`` of predicted displacements ``u`` (b, n, 3) mm.
+) -> Callable[[jax.Array, Runs], jax.Array]:
+    """Return ``loss(u, batch)`` of predicted displacements ``u`` (b, n, 3) mm, by FEM's in a batch.
 
     weight : the factor gamma of the objective ``both``.
     """
     Pi = jax.vmap(potential_energy(scene, Barriers()))
 
-    def energy(u: jax.Array, batch: Batch) -> jax.Array:
+    def energy(u: jax.Array, batch: Runs) -> jax.Array:
         return jnp.mean(Pi(u, batch.theta)) / scales.energy
 
-    def simulations(u: jax.Array, batch: Batch) -> jax.Array:
+    def simulations(u: jax.Array, batch: Runs) -> jax.Array:
         misfit = jnp.sum((u - batch.displacement) ** 2, axis=-1)
         return jnp.mean(misfit) / scales.displacement**2
 
-    def gradients(u: jax.Array, batch: Batch) -> jax.Array:
+    def gradients(u: jax.Array, batch: Runs) -> jax.Array:
         misfit = mean_square_gradient(scene, u - batch.displacement)
         return simulations(u, batch) + misfit / scales.gradient**2
 
-    def both(u: jax.Array, batch: Batch) -> jax.Array:
+    def both(u: jax.Array, batch: Runs) -> jax.Array:
         gap = (Pi(u, batch.theta) - batch.energy) / jnp.abs(batch.energy)
         return simulations(u, batch) + weight * jnp.mean(gap)
 

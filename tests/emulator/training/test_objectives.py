@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.fem import run_campaign, sobol
+from emulator.fem import Runs, run_campaign, sobol
 from emulator.surrogates import Architecture
 from emulator.training.graph_network import GraphNetwork
-from emulator.training.objectives import OBJECTIVES, Batch, Scales, loss_scales, make_loss
+from emulator.training.objectives import OBJECTIVES, Scales, loss_scales, make_loss
 from emulator.training.plan import Job
 
 SMALL = Architecture(steps=2, latent=8, hidden=(16, 16))
@@ -25,7 +25,7 @@ def tests(beam, simulator):
 
 def test_objectives_by_hand(beam, tests):
     u = tests.displacement + 0.1
-    batch = Batch(*tests[:3])
+    batch = Runs(*tests[:3])
     Pi = em.potential_energy(beam)
     values = np.array([Pi(v, t) for v, t in zip(u, tests.theta, strict=True)])
     misfit = 3 * 0.1**2 / 4.0
@@ -75,13 +75,13 @@ def test_gradients_by_an_independent_evaluation(tests):
         u_part = np.mean(np.sum((found - exact) ** 2, axis=1)) / SCALES.displacement**2
         misfits.append(u_part + F_part)
     assert np.ptp(volume) > volume.min()
-    loss = make_loss(graded, "gradients", SCALES, 0.5)(jnp.asarray(u), Batch(*tests[:3]))
+    loss = make_loss(graded, "gradients", SCALES, 0.5)(jnp.asarray(u), Runs(*tests[:3]))
     assert float(loss) == pytest.approx(np.mean(misfits), rel=1e-12)
 
 
 def test_the_slope_of_gradients_by_differences(beam, tests):
     loss = make_loss(beam, "gradients", SCALES, 0.5)
-    batch, u = Batch(*tests[:3]), rough(tests)
+    batch, u = Runs(*tests[:3]), rough(tests)
     direction = np.random.default_rng(4).normal(size=u.shape)
     step = 1e-3  # the loss is quadratic: differences are exact but for round-off
     ahead, behind = (loss(jnp.asarray(u + sign * step * direction), batch) for sign in (1, -1))
@@ -92,7 +92,7 @@ def test_the_slope_of_gradients_by_differences(beam, tests):
 
 @pytest.mark.parametrize("objective", ["energy", "simulations", "both"])
 def test_other_objectives_do_not_know_the_scale_of_gradients(beam, tests, objective):
-    u, batch = jnp.asarray(rough(tests)), Batch(*tests[:3])
+    u, batch = jnp.asarray(rough(tests)), Runs(*tests[:3])
     without = SCALES._replace(gradient=float("nan"))
     one, other = (make_loss(beam, objective, scales, 0.5)(u, batch) for scales in (SCALES, without))
     assert float(one) == float(other)
@@ -103,7 +103,7 @@ def test_both_terms_of_gradients_are_one_at_the_centre(beam):
     plan = GraphNetwork(objective="gradients", steps=1, simulations=8, batch=4)
     runs = plan.prepare(Job(beam, SMALL)).runs
     scales = loss_scales(beam, runs, from_runs=True)
-    batch = Batch(*runs.take(slice(1, None))[:3])
+    batch = Runs(*runs.take(slice(1, None))[:3])
     centre = jnp.broadcast_to(runs.displacement[0], batch.displacement.shape)
     simulations, gradients = (
         float(make_loss(beam, name, scales, 0.5)(centre, batch))
