@@ -26,7 +26,7 @@ from emulator.training.mechanics import add_discrepancy, series_and_runs
 from emulator.training.network_plan import Problem, architecture_of, untrained
 from emulator.training.objectives import Objective, component_scales
 from emulator.training.optimiser import cosine
-from emulator.training.plan import Job, check_order
+from emulator.training.plan import Job, check_order, check_runs
 
 _SAMPLES = 400  # positions over which a mode's energy is averaged
 _TRUNCATION = 1e-12  # least energy of a mode, relative to the largest
@@ -53,7 +53,7 @@ class Hybrid(BatchPlan):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require_runs()
+        check_runs(self.simulations)
         check_order(self.order)
 
     @property

@@ -23,7 +23,7 @@ from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.taylor import Expansion, constant, expand
 from emulator.training.checkpoint import Record, Session
 from emulator.training.family import family_on
-from emulator.training.plan import FEWEST, Job, Plan, check_order
+from emulator.training.plan import FEWEST, Job, Plan, check_order, check_runs
 
 _HELD_OUT = 5  # every fifth run is held out
 _OBSERVATIONS = 4000  # values and derivatives; their covariance matrix takes 128 MB
@@ -43,7 +43,7 @@ class DiscrepancyPlan(Plan):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require_runs()
+        check_runs(self.simulations)
 
     def prepare(self, job: Job) -> tuple[Emulator, Runs, Expansion | None]:
         """Return the emulator without its discrepancy model, the FEM runs, and FEM's series."""

@@ -27,7 +27,7 @@ from emulator.training.mode_fit import ModeFit
 from emulator.training.network_plan import NetworkPlan, Problem, architecture_of, untrained
 from emulator.training.objectives import loss_scales
 from emulator.training.optimiser import NetworkTraining, orthogonal_steps, two_cosines
-from emulator.training.plan import Job
+from emulator.training.plan import Job, check_runs
 
 ARCHITECTURE = Architecture(
     steps=3,
@@ -61,7 +61,7 @@ class Modal(NetworkPlan):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require_runs("modes need")
+        check_runs(self.simulations, "modes need")
 
     @property
     def budget_share(self) -> float:

@@ -90,11 +90,11 @@ class Plan:
                     f"training: {name} is {getattr(self, name)}; it must be {least} or more"
                 )
 
-    def require_runs(self, needed_by: str = "a discrepancy model needs") -> None:
-        """Raise :class:`InputError` where no FEM run is to be made besides the centre's."""
-        simulations: int = getattr(self, "simulations")  # noqa: B009
-        if simulations < 1:
-            raise InputError(f"training: {simulations} simulations; {needed_by} 1 or more")
+
+def check_runs(simulations: int, needed_by: str = "a discrepancy model needs") -> None:
+    """Raise :class:`InputError` where no FEM run is to be made besides the centre's."""
+    if simulations < 1:
+        raise InputError(f"training: {simulations} simulations; {needed_by} 1 or more")
 
 
 def check_order(order: int) -> None:

@@ -133,7 +133,7 @@ class Runs(NamedTuple):
     energy: jax.Array
     sensitivities: jax.Array | None = None
 
-    def take(self, rows: slice | np.ndarray) -> Runs:
+    def take(self, rows: slice | np.ndarray | jax.Array) -> Runs:
         """Return some of the runs."""
         return jax.tree.map(lambda array: array[rows], self)
 
