@@ -105,7 +105,7 @@ def parts(definite: System, u: jax.Array, theta: jax.Array) -> dict[str, Any]:
     definite.safe_tangent(u, theta, 1.0)
     tangent, (K, _) = clocked(lambda: definite.safe_tangent(u, 1.01 * theta, 1.0))
     b = jnp.asarray(np.random.default_rng(SEED).normal(size=definite.pattern.size))
-    solve = jax.jit(partial(SUITESPARSE.solve, definite.pattern, definite=True))
+    solve = jax.jit(partial(SUITESPARSE.solve, definite.pattern, kind="definite"))
     jax.block_until_ready(solve(K, b))
     other, _ = definite.safe_tangent(u, 1.02 * theta, 1.0)
     both, _ = clocked(lambda: solve(other, b))

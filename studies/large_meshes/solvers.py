@@ -82,7 +82,7 @@ def factorised(solver: str, matrix: Any, pattern: Pattern) -> Case:
         row = {"iterations": factor._ksp.getIterationNumber()}
     else:
         free_factors()
-        solve = jax.jit(lambda values, b: SUITESPARSE.solve(pattern, values, b, definite=True)[0])
+        solve = jax.jit(lambda values, b: SUITESPARSE.solve(pattern, values, b, "definite")[0])
         with_solution = lambda *given: np.asarray(solve(*given))  # noqa: E731
         first, _ = both_times(with_solution, matrix["first"], b)
         second, _ = both_times(with_solution, matrix["second"], b)

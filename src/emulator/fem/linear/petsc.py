@@ -23,7 +23,7 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.fem.linear.pattern import Pattern
-from emulator.fem.linear.solve import Direct, Outcome
+from emulator.fem.linear.solve import Direct, Kind, Outcome, Solved
 
 INSTALL = "pip install dolfinx-solver-real mpich mpi4py, or petsc4py for a PETSc with MUMPS"
 # Residual relative to |A| |x| + |b| that a direct solver leaves at most. Block low-rank factors
@@ -169,18 +169,9 @@ class Petsc(Direct):
         """Raise :class:`InputError` where PETSc or MUMPS is missing."""
         petsc_module()
 
-    def solve(
-        self,
-        pattern: Pattern,
-        values: jax.Array,
-        rhs: jax.Array,
-        *,
-        definite: bool,
-        transposed: bool = False,
-    ) -> tuple[jax.Array, jax.Array]:
-        """Solve by LDL^T, whose pivots must be positive where ``definite``, or LU."""
-        transposed = transposed and not pattern.upper
-        on_host = partial(self._solve, pattern, definite=definite, transposed=transposed)
+    def solve(self, pattern: Pattern, values: jax.Array, rhs: jax.Array, kind: Kind) -> Solved:
+        """Solve by LDL^T, whose pivots must be positive where definite, or LU."""
+        on_host = partial(self._solve, pattern, kind=kind)
         if not any(isinstance(x, jax.core.Tracer) for x in (values, rhs)):
             x, outcome = on_host(values, rhs)
             return jnp.asarray(x), jnp.asarray(outcome)
@@ -189,7 +180,7 @@ class Petsc(Direct):
         return x, outcome
 
     def _solve(
-        self, pattern: Pattern, values: jax.Array, b: jax.Array, *, definite: bool, transposed: bool
+        self, pattern: Pattern, values: jax.Array, b: jax.Array, kind: Kind
     ) -> tuple[np.ndarray, np.int32]:
         columns = np.asarray(b)
         with self._lock:
@@ -197,8 +188,9 @@ class Petsc(Direct):
                 factor = self._factorised(pattern, np.asarray(values))
             except SingularMatrix:
                 return np.full(columns.shape, np.nan), np.int32(Outcome.SINGULAR)
-            if definite and factor.negative_eigenvalues():
+            if kind == "definite" and factor.negative_eigenvalues():
                 return np.full(columns.shape, np.nan), np.int32(Outcome.INDEFINITE)
+            transposed = kind == "transposed" and not pattern.upper
             solve = partial(factor.solve, transposed=transposed)
             if columns.ndim == 1:
                 return solve(columns), np.int32(Outcome.OK)

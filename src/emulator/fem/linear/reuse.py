@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from emulator.fem.compiled import compiled, while_loop
 from emulator.fem.linear.pattern import Pattern
-from emulator.fem.linear.solve import Direct, Outcome
+from emulator.fem.linear.solve import Direct, Outcome, Solved
 from emulator.fem.linear.suitesparse import keeping_factors
 
 TOLERANCE = 1e-10  # relative residual, in the norm of the inverse factorised tangent
@@ -109,7 +109,7 @@ class KeptFactor:
         self._iterations = max(_PATIENCE, affordable)
         program = (lambda function: function) if direct.on_host else compiled
         self._product = compiled(pattern.product)
-        self._solve = program(partial(direct.solve, pattern, definite=True))
+        self._solve = program(partial(direct.solve, pattern, kind="definite"))
         self._solve_beside = program(self._conjugate_gradients)
         self.factorisations = 0
 
@@ -118,9 +118,7 @@ class KeptFactor:
         """Return whether the matrices are large enough for a kept factor to save time."""
         return pattern.upper and pattern.size >= _LARGE
 
-    def attempt(
-        self, tangent: jax.Array, b: jax.Array, *, may_reuse: bool = True
-    ) -> tuple[jax.Array, jax.Array]:
+    def attempt(self, tangent: jax.Array, b: jax.Array, *, may_reuse: bool = True) -> Solved:
         """Return ``x`` (f,) with ``K x = b``, and the outcome.
 
         may_reuse : whether the kept factor may serve; otherwise ``tangent`` is factorised and kept.

@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from enum import IntEnum
 from functools import partial
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,14 @@ class Outcome(IntEnum):
     SINGULAR = 2
 
 
+Solved = tuple[jax.Array, jax.Array]
+"""A solution x, (size,) or (size, k), and its :class:`Outcome`, int32 ()."""
+
+Kind = Literal["definite", "general", "transposed"]
+"""What is solved with: a matrix that must be positive definite, given by its upper triangle, or
+else is INDEFINITE; any matrix; or the transpose of any."""
+
+
 class Direct(ABC):
     """A direct solver.
 
@@ -45,33 +53,18 @@ class Direct(ABC):
         """Load the solver's library; :class:`InputError` where it is not installed."""
 
     @abstractmethod
-    def solve(
-        self,
-        pattern: Pattern,
-        values: jax.Array,
-        rhs: jax.Array,
-        *,
-        definite: bool,
-        transposed: bool = False,
-    ) -> tuple[jax.Array, jax.Array]:
-        """Return ``x`` with ``A x = rhs``, (size,) or (size, k), and an :class:`Outcome`, int32 ().
-
-        definite : report INDEFINITE unless ``A``, given by its upper triangle, is positive
-            definite.
-        transposed : whether to solve with the transpose of ``A``.
-        """
+    def solve(self, pattern: Pattern, values: jax.Array, rhs: jax.Array, kind: Kind) -> Solved:
+        """Return ``x`` with ``A x = rhs``, and the outcome."""
 
 
-def attempt(
-    direct: Direct, pattern: Pattern, values: jax.Array, rhs: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def attempt(direct: Direct, pattern: Pattern, values: jax.Array, rhs: jax.Array) -> Solved:
     """Return ``x`` with ``A x = rhs`` and the outcome, without derivatives.
 
     A matrix stored as an upper triangle must be positive definite; no other factorisation is tried.
     """
     if not pattern.upper:
-        return _solve_whole(direct, pattern, values, rhs, transposed=False)
-    return direct.solve(pattern, values, rhs, definite=True)
+        return _solve_whole(direct, pattern, values, rhs, "general")
+    return direct.solve(pattern, values, rhs, "definite")
 
 
 def solve(direct: Direct, pattern: Pattern, values: jax.Array, rhs: jax.Array) -> jax.Array:
@@ -80,35 +73,35 @@ def solve(direct: Direct, pattern: Pattern, values: jax.Array, rhs: jax.Array) -
     The solution is differentiable in ``values`` and ``rhs``; ``vmap`` solves one after the other.
     """
     if direct.on_host and not any(isinstance(x, jax.core.Tracer) for x in (values, rhs)):
-        return _solve_any(direct, pattern, values, rhs, transposed=False)
+        return _solve_any(direct, pattern, values, rhs, "general")
     constant = jax.lax.stop_gradient(values)
 
-    def solution(b: jax.Array, *, transposed: bool) -> jax.Array:
-        return one_by_one(partial(_solve_any, direct, pattern, transposed=transposed))(constant, b)
+    def solution(b: jax.Array, kind: Kind) -> jax.Array:
+        return one_by_one(partial(_solve_any, direct, pattern, kind=kind))(constant, b)
 
     return jax.lax.custom_linear_solve(
         partial(pattern.product, values),
         rhs,
-        lambda _, b: solution(b, transposed=False),
-        lambda _, b: solution(b, transposed=True),
+        lambda _, b: solution(b, "general"),
+        lambda _, b: solution(b, "transposed"),
         symmetric=pattern.upper,
     )
 
 
 def _solve_any(
-    direct: Direct, pattern: Pattern, values: jax.Array, b: jax.Array, *, transposed: bool
+    direct: Direct, pattern: Pattern, values: jax.Array, b: jax.Array, kind: Kind
 ) -> jax.Array:
     """Solve with any regular matrix: by a general factorisation where it is indefinite."""
     if not pattern.upper:
-        return _solve_whole(direct, pattern, values, b, transposed=transposed)[0]
+        return _solve_whole(direct, pattern, values, b, kind)[0]
     x, outcome = attempt(direct, pattern, values, b)
-    general = partial(direct.solve, pattern, values, b, definite=False)
+    general = partial(direct.solve, pattern, values, b, "general")
     return cond(outcome == Outcome.INDEFINITE, lambda: general()[0], lambda: x)
 
 
 def _solve_whole(
-    direct: Direct, pattern: Pattern, values: jax.Array, b: jax.Array, *, transposed: bool
-) -> tuple[jax.Array, jax.Array]:
+    direct: Direct, pattern: Pattern, values: jax.Array, b: jax.Array, kind: Kind
+) -> Solved:
     """Solve with a matrix stored with both triangles; return ``x`` and the outcome.
 
     At rest, and where unloading begins, such tangents are symmetric and definite of either sign: a
@@ -116,13 +109,13 @@ def _solve_whole(
     """
     half = pattern.half
 
-    def general() -> tuple[jax.Array, jax.Array]:
-        return direct.solve(pattern, values, b, definite=False, transposed=transposed)
+    def general() -> Solved:
+        return direct.solve(pattern, values, b, kind)
 
-    def symmetric() -> tuple[jax.Array, jax.Array]:
+    def symmetric() -> Solved:
         upper = half.sum(values)
         sign = jnp.sign(jnp.sum(jnp.where(half.rows == half.columns, upper, 0.0)))
-        x, outcome = direct.solve(half, sign * upper, sign * b, definite=True)
+        x, outcome = direct.solve(half, sign * upper, sign * b, "definite")
         return cond(outcome == Outcome.OK, lambda: (x, outcome), general)
 
     return cond(pattern.is_symmetric(values), symmetric, general)

@@ -35,7 +35,7 @@ from threadpoolctl import ThreadpoolController
 
 from emulator.core.errors import InputError
 from emulator.fem.linear.pattern import Pattern
-from emulator.fem.linear.solve import Direct, Outcome
+from emulator.fem.linear.solve import Direct, Kind, Outcome, Solved
 
 _CHOLMOD, _UMFPACK = "calibrate_cholmod", "calibrate_umfpack"
 _FACTORS = 2  # factors of each pattern that are kept by default
@@ -50,25 +50,17 @@ class SuiteSparse(Direct):
         """Prepare the library, which is always installed."""
         _prepare()
 
-    def solve(
-        self,
-        pattern: Pattern,
-        values: jax.Array,
-        rhs: jax.Array,
-        *,
-        definite: bool,
-        transposed: bool = False,
-    ) -> tuple[jax.Array, jax.Array]:
+    def solve(self, pattern: Pattern, values: jax.Array, rhs: jax.Array, kind: Kind) -> Solved:
         """Return the solution and the outcome."""
         _prepare()
         shapes = jax.ShapeDtypeStruct(rhs.shape, jnp.float64), jax.ShapeDtypeStruct((), jnp.int32)
         call = partial(jax.ffi.ffi_call, result_shape_dtypes=shapes, vmap_method="sequential")
-        if definite:
+        if kind == "definite":
             x, outcome = call(_CHOLMOD)(
                 pattern.rows, pattern.columns, values, rhs, mode=np.int64(0)
             )
         else:
-            trans = np.int64(transposed)
+            trans = np.int64(kind == "transposed")
             x, outcome = call(_UMFPACK)(*pattern.both(values), rhs, trans=trans)
         return x, outcome
 

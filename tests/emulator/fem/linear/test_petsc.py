@@ -85,7 +85,7 @@ def test_inertia_tells_a_definite_matrix_from_an_indefinite_one():
 @pytest.mark.usefixtures("petsc")
 def test_a_singular_matrix_is_named():
     _, pattern, values, b = matrix()
-    x, outcome = PETSC.solve(pattern, 0.0 * values, b, definite=False)
+    x, outcome = PETSC.solve(pattern, 0.0 * values, b, "general")
     assert outcome == Outcome.SINGULAR
     assert np.isnan(x).all()
     # The next matrix is not harmed.
