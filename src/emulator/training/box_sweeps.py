@@ -281,20 +281,16 @@ def _fitted(state: SweepState, level: float, new: Samples, error: float) -> Swee
         rise, gap = min(1.5 * state.rise, 1.0 / _LEVELS), level - state.level
         state = state._replace(here=0, level=level, rise=rise, gap=gap)
     else:
-        degree, before = (
-            best_degree(state.values, new, state.polynomial.degree, error),
-            state.before,
-        )
+        degree = best_degree(state.values, new, state.polynomial.degree, error)
+        before = state.before
         most = _TARGETS_PER_TERM * min(terms(new.position.shape[1], degree + 1), MOST_TERMS)
         known = state.values.followed_by(new).take(slice(-max(most, 4 * len(new.position)), None))
     polynomial = fit(known, degree, error)
     padded = np.zeros_like(polynomial.coefficients)  # terms of low degree come first
     shared = min(len(padded), len(before))
     padded[:shared] = before[:shared]
-    here = state.here + 1
-    return state._replace(
-        polynomial=polynomial, before=padded, values=known, here=here, error=error
-    )
+    state = state._replace(polynomial=polynomial, before=padded, values=known)
+    return state._replace(here=state.here + 1, error=error)
 
 
 def polynomial_part(simulator: Simulator, state: SweepState) -> Polynomial:
