@@ -89,9 +89,9 @@ def infer() -> None:
 
 def parse() -> list[Frame]:
     """Return the frames from ``calibrate infer`` to the reader of its CSV file."""
-    from calibrate.measurements.tables import CSVTable
+    from calibrate.measurements import data
 
-    return journey(CSVTable, "__init__", infer)
+    return journey(data, "read_csv", infer)
 
 
 def likelihood() -> list[Frame]:

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from calibrate.cli import COMMANDS, build_parser
-from calibrate.measurements.registry import OBSERVATIONS
-from calibrate.noise.registry import NOISES
+from calibrate.measurements import OBSERVATIONS
+from calibrate.noise import NOISES
 from calibrate.samplers.registry import SAMPLERS
 from emulator.fem.formulations import FORMULATIONS
 from emulator.fem.linear import SOLVERS

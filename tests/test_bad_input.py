@@ -17,7 +17,7 @@ from calibrate.analysis.sbc import sbc
 from calibrate.cli import COMMANDS as COMMAND_NAMES
 from calibrate.cli import main
 from calibrate.cli.words import seconds
-from calibrate.measurements.data import read_data, write_data
+from calibrate.measurements.data import read_measurements, write_data
 from calibrate.project import Run, make_data
 from cli_support import write_block
 from emulator.core.errors import InputError
@@ -97,8 +97,8 @@ PYTHON = [
     (lambda: sbc(model(), scheduler="tcp://127.0.0.1:9"), "a linear map solves no FEM"),
     (lambda: cal.compare({}), "compare: 0 posterior is given; give two or more"),
     (lambda: cal.truncated_normal(1.0, -1.0, low=0.0, high=2.0), "-1"),
-    (lambda: read_data(BEAM, "none.csv"), "none.csv does not exist"),
-    (lambda: read_data(BEAM, "twice.csv"), "landmarks 0 and 2 are both at"),
+    (lambda: read_measurements(BEAM, "none.csv"), "none.csv does not exist"),
+    (lambda: read_measurements(BEAM, "twice.csv"), "landmarks 0 and 2 are both at"),
     (lambda: Run("liver", data="blanks.csv", truth={"mu": 5.0}), "truth has no effect beside data"),
     (lambda: Run("liver", draws=0), "draws is 0; it must be 1 or more"),
     (lambda: Run("liver", forward_options={"fem_runs": 9}), "no effect without --forward reduced"),
@@ -212,7 +212,7 @@ def test_unusual_input_is_taken(folder, monkeypatch, tmp_path):
     monkeypatch.chdir(folder)
     scene = em.scenes.once_clamped_beam()
     for name in ("tabs", "blanks"):
-        observe, data = read_data(scene, f"{name}.csv")
+        observe, data = read_measurements(scene, f"{name}.csv")[:2]
         np.testing.assert_array_equal(observe.parts["displacement"].nodes, FREE_END)
         np.testing.assert_array_equal(data["displacement"][:, 2], -15.0)
     assert seconds("1h30m") == 5400.0

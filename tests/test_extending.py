@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calibrate.measurements.registry import OBSERVATIONS
+from calibrate.measurements import OBSERVATIONS
 from calibrate.samplers.registry import SAMPLERS
 from emulator.fem import Status
 from emulator.mechanics.kinematics import Strain

@@ -27,10 +27,8 @@ def in_state(name: str, state: str) -> str:
 def states_of(names: Iterable[str], what: str = "observations") -> tuple[str, ...]:
     """Return the states that ``names`` name, each once.
 
-    Raises
-    ------
-    InputError
-        Some names have a state and others do not, or a state is an empty word.
+    :class:`InputError` where some names have a state and others do not, or a state is an empty
+    word.
     """
     names = tuple(names)
     for name in names:

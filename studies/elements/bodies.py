@@ -6,9 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import emulator as em
-from calibrate.measurements.location import locate, locate_gradients
+from calibrate.measurements.location import gradients_at, locate
 from emulator.core.errors import InputError
-from emulator.geometry.discretisation import from_quadrature_points, quadrature_points
+from emulator.geometry.discretisation import (
+    from_quadrature_points,
+    quadrature_points,
+    shapes_at,
+)
 from emulator.geometry.facets import Cavity
 from emulator.geometry.fibres import (
     Depth,
@@ -193,13 +197,14 @@ def measured(scene: Scene, fields: np.ndarray, points: np.ndarray) -> Measured:
     strains = np.full(landmarks.shape[:2], np.nan)
     for k, point in enumerate(points):
         try:
-            elements, values = locate(scene.mesh, point[None])
+            elements, inside = locate(scene.mesh, point[None])
         except InputError:
             continue
         local = fields[:, scene.mesh.elements[elements[0]]]
+        values, _ = shapes_at(scene.mesh.order, inside)
         landmarks[:, k] = np.einsum("a,tai->ti", values[0], local)
         if scene.fibres is not None:
-            _, inside, gradients = locate_gradients(scene.mesh, point[None])
+            gradients = gradients_at(scene.mesh, elements, inside)
             weights = from_quadrature_points(scene.mesh.order, inside)[0]
             f = unit(weights @ scene.fibres_at_points[elements[0]])
             along = np.einsum("tai,aj,j->ti", local, gradients[0], f)

@@ -34,7 +34,7 @@ from studies.sheep_myocardium.curves import Emulated, forces
 from studies.sheep_myocardium.experiment import MODES, Heart
 from studies.sheep_myocardium.moves import EXPLORING, Modes, joined, modes, unknown
 
-from calibrate.model_error.systematic import curve_covariance
+from calibrate.model_error.systematic import curve_correlation
 from calibrate.samplers.diagnostics import least_ess, r_hat
 
 CELL = 3e-3  # N, noise of the load cell
@@ -124,7 +124,8 @@ def means(of: Seen, material: jax.Array, turned: jax.Array) -> jax.Array:
 def covariances(amounts: jax.Array, mean: jax.Array, omega: jax.Array) -> jax.Array:
     """Covariances (..., j, j) in N2 of modes' data with ``mean`` (..., j)."""
     length = 0.5 * jnp.abs(amounts).max(axis=-1)[..., None, None]
-    alike = curve_covariance(amounts, mean, length, share=omega, constant=0.5)
+    products = mean[..., :, None] * mean[..., None, :]
+    alike = omega**2 * products * curve_correlation(amounts, length, 0.5)
     own = jnp.eye(mean.shape[-1]) * mean[..., None, :] ** 2
     return alike + POINT**2 * own + CELL**2 * jnp.eye(mean.shape[-1])
 

@@ -173,7 +173,7 @@ def _posterior_covariances(
         error: ModelError | None,
     ) -> jax.Array:
         means, valid = answer
-        log_density = model.log_density(means, model.noise_values({}), data)
+        log_density = model.log_density({}, means, data)
         if error is not None:
             residual = {name: data[name] - mean for name, mean in means.items()}
             log_density += log_ratio(error, thetas(x), residual, means)
@@ -207,7 +207,7 @@ def _posterior_covariances(
         noise_key, *round_keys, error_key = keys
         if error is not None:
             means = error.draw(error_key, jnp.concatenate([thetas(x), sizes]), means)
-        parts = model.distributions(means, model.noise_values({}))
+        parts = model.distributions({}, means)
         each = jax.random.split(noise_key, len(parts))
         data = {n: d.sample(k) for (n, d), k in zip(parts.items(), each, strict=True)}
         likely_shared = jax.vmap(log_likelihood, in_axes=(0, 0, None, None))(

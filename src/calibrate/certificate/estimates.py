@@ -320,7 +320,7 @@ def misfits(
 
     def discrepancies(flat: jax.Array, draw: dict[str, jax.Array], key: jax.Array) -> Any:
         means = predictive.by_name(flat)
-        parts = model.distributions(means, model.noise_values(draw))
+        parts = model.distributions(draw, means)
         key, mesh_key = jax.random.split(key)
         errors = jax.tree.map(jnp.subtract, model.fem_means(mesh_key, draw, means), means)
         keys = jax.random.split(key, len(parts))

@@ -4,6 +4,13 @@ A kind of observation is a subclass of :class:`Observation`; the kinds are liste
 :data:`OBSERVATIONS`. :class:`Observations` holds several of one body by name.
 """
 
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import Any
+
 from calibrate.measurements.collection import (
     Observations,
     leave_out_missing,
@@ -12,44 +19,62 @@ from calibrate.measurements.collection import (
 )
 from calibrate.measurements.displacements import (
     Landmarks,
+    Length,
+    NodalDisplacements,
     landmarks,
     length_between,
     nodal_displacements,
+    nodes_called,
     spread_landmarks,
     spread_nodes,
 )
 from calibrate.measurements.klotz import Klotz, KlotzVolume
 from calibrate.measurements.observation import Observation, Scalar
 from calibrate.measurements.parameter import MeasuredParameter
-from calibrate.measurements.points import DISPLACEMENT, DisplacementPoints, PointObservation
+from calibrate.measurements.points import DISPLACEMENT
 from calibrate.measurements.reaction import Reaction
-from calibrate.measurements.registry import (
-    OBSERVATIONS,
-    observation_from_json,
-    observations_from_json,
-    parse_observation,
-)
-from calibrate.measurements.strain import segment_strains, strains
+from calibrate.measurements.strain import SegmentStrain, Strain, segment_strains, strains
 from calibrate.measurements.surface import (
+    RigidMarkers,
+    SurfacePoints,
     rigid_markers,
     spread_on_surface,
     surface_distances,
     surface_points,
 )
 from calibrate.measurements.volume import CavityVolume
+from calibrate.state_names import in_state, split
+from emulator.core.errors import InputError, look_up
+from emulator.scenes.scene import Scene
+
+# Kinds are tried in this order on a file's columns: `node` comes before `x,y,z`.
+OBSERVATIONS: dict[str, type[Observation]] = {
+    kind.kind: kind
+    for kind in (
+        NodalDisplacements,
+        Landmarks,
+        Strain,
+        SegmentStrain,
+        SurfacePoints,
+        RigidMarkers,
+        CavityVolume,
+        KlotzVolume,
+        Length,
+        Reaction,
+        MeasuredParameter,
+    )
+}
 
 __all__ = [
     "DISPLACEMENT",
     "OBSERVATIONS",
     "CavityVolume",
-    "DisplacementPoints",
     "Klotz",
     "KlotzVolume",
     "Landmarks",
     "MeasuredParameter",
     "Observation",
     "Observations",
-    "PointObservation",
     "Reaction",
     "Scalar",
     "landmarks",
@@ -57,7 +82,6 @@ __all__ = [
     "length_between",
     "missing_values",
     "nodal_displacements",
-    "observation_from_json",
     "observations",
     "observations_from_json",
     "parse_observation",
@@ -70,3 +94,51 @@ __all__ = [
     "surface_distances",
     "surface_points",
 ]
+
+
+def parse_observation(
+    scene: Scene, text: str, seed: int = 0, states: Sequence[str] = ("",)
+) -> Observations:
+    """Return what the words joined by ``+`` ask for, e.g. ``landmarks:24+volume``.
+
+    A word is asked for in each of ``states``; ``volume@diastole`` in that load state only.
+
+    Raises
+    ------
+    InputError
+        A word that no kind understands, or two observations of the same name.
+    """
+    parts: dict[str, Observation] = {}
+    for word in text.split("+"):
+        bare, own_state = split(word)
+        base, part = _parse_word(scene, bare, seed)
+        for state in (own_state,) if own_state else states:
+            if (name := in_state(base, state)) in parts:
+                raise InputError(f"observe '{text}': {name} is given twice; once is enough")
+            parts[name] = part
+    return Observations(parts)
+
+
+def _parse_word(scene: Scene, word: str, seed: int) -> tuple[str, Observation]:
+    """Return name and observation; a word's part before the colon is its kind, else it is nodes."""
+    if kind := OBSERVATIONS.get(word.partition(":")[0]):
+        return kind.parse(scene, word, seed)
+    if nodes := nodes_called(scene, word):
+        return DISPLACEMENT, nodes
+    raise InputError(
+        f"observe '{word}': give {', '.join(kind.usage for kind in OBSERVATIONS.values())}; "
+        f"node sets: {', '.join(sorted(scene.mesh.node_sets)) or 'none here'}"
+    )
+
+
+def observations_from_json(
+    scene: Scene, description: Mapping[str, Mapping[str, Any]]
+) -> Observations:
+    """Return what :meth:`Observations.to_json` described."""
+
+    @cache
+    def made(text: str) -> Observation:
+        each = json.loads(text)
+        return look_up(OBSERVATIONS, each.get("kind"), "observation kind").from_json(scene, each)
+
+    return Observations({name: made(json.dumps(each)) for name, each in description.items()})

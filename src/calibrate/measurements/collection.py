@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -21,19 +22,22 @@ from emulator.core.errors import InputError
 class Observations:
     """Observations by name; one forward map serves them all.
 
-    parts : the observations by name. In a body with several load states each name says which one
-        is meant, as in ``volume@diastole`` (:mod:`calibrate.statistical_model.load_states`).
+    parts : the observations by name; those with one description become one object. In a body with
+        several load states each name says which one is meant, as in ``volume@diastole``
+        (:mod:`calibrate.statistical_model.load_states`).
     """
 
     parts: Mapping[str, Observation]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "parts", MappingProxyType(dict(self.parts)))
         if not self.parts:
             raise InputError("nothing is observed; name one observation or more")
         for name in self.parts:
             if not isinstance(name, str) or not name or "/" in name:
                 raise InputError(f"observation is called {name!r}; use a name without '/'")
+        distinct: dict[str, Observation] = {}
+        parts = {n: distinct.setdefault(json.dumps(p.to_json()), p) for n, p in self.parts.items()}
+        object.__setattr__(self, "parts", MappingProxyType(parts))
         self.states  # noqa: B018 - names that contradict each other are refused here
 
     @cached_property
@@ -61,11 +65,8 @@ class Observations:
     @cached_property
     def _rows(self) -> dict[str, np.ndarray | slice]:
         """Positions in ``nodes`` of each part's nodes."""
-        order = np.argsort(self.nodes)
-        rows = {
-            name: order[np.searchsorted(self.nodes, part.nodes, sorter=order)]
-            for name, part in self.parts.items()
-        }
+        position = {node: k for k, node in enumerate(self.nodes.tolist())}
+        rows = {n: np.array([position[k] for k in p.nodes.tolist()]) for n, p in self.parts.items()}
         return {
             name: slice(len(k)) if np.array_equal(k, np.arange(len(k))) else k
             for name, k in rows.items()
@@ -84,12 +85,16 @@ class Observations:
         displacement : the displacement of ``nodes`` in every load state, mm, (..., S, k, 3).
         thetas : theta in every load state, (..., S, p).
         """
+        # One observation in several load states, as of a curve, is one program.
+        groups: dict[Observation, list[str]] = {}
+        for name, part in self.parts.items():
+            groups.setdefault(part, []).append(name)
         data: dict[str, jax.Array] = {}
-        for names in self._groups:
-            part, rows = self.parts[names[0]], self._rows[names[0]]
+        for part, names in groups.items():
+            rows = self._rows[names[0]]
             states = [self.states.index(split(name)[1]) for name in names]
             if len(states) == 1:  # one state needs no gather
-                state = states[0]
+                (state,) = states
                 data[names[0]] = part(displacement[..., state, rows, :], thetas[..., state, :])
                 continue
             index = np.array(states)
@@ -98,24 +103,13 @@ class Observations:
             data |= dict(zip(names, by_state, strict=True))
         return {name: data[name] for name in self.parts}
 
-    @cached_property
-    def _groups(self) -> list[list[str]]:
-        """Names by their observation: one in several load states, as of a curve, is one program."""
-        groups: dict[Observation, list[str]] = {}
-        for name, part in self.parts.items():
-            groups.setdefault(part, []).append(name)
-        return list(groups.values())
-
     def expand[T](self, values: Mapping[str, T], what: str) -> dict[str, tuple[str, T]]:
         """Return values by the parts' names, from values by name, with or without its load state.
 
         ``{"volume": v}`` gives ``v`` to the volume of every load state. Each value comes with the
         name it was given under; a part that ``values`` does not mention has none.
 
-        Raises
-        ------
-        InputError
-            A value without a part; the message begins with ``what``.
+        :class:`InputError`, which begins with ``what``, for a value without a part.
         """
         known = dict.fromkeys((*self.parts, *self.bases))
         for name in values:
@@ -127,10 +121,8 @@ class Observations:
     def name[T](self, values: T | Mapping[str, T], what: str) -> dict[str, T]:
         """Return ``values`` by the parts' names, in their order; a bare value is a single part's.
 
-        Raises
-        ------
-        InputError
-            A part without a value, or a value without a part; the message begins with ``what``.
+        :class:`InputError`, which begins with ``what``, for a part without a value and the other
+        way round.
         """
         known = ", ".join(self.parts)
         if not isinstance(values, Mapping):
@@ -161,10 +153,7 @@ def leave_out_missing(
 ) -> tuple[Observations, dict[str, np.ndarray]]:
     """Return observations and data without the entries that are NaN.
 
-    Raises
-    ------
-    InputError
-        An observation of which every value is missing.
+    :class:`InputError` for an observation of which every value is missing.
     """
     parts, present = dict(observe.parts), dict(data)
     for name, values in data.items():

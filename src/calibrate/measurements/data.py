@@ -23,28 +23,33 @@ variables.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 
+from calibrate.measurements import OBSERVATIONS
 from calibrate.measurements.collection import Observations, check_some, observations
 from calibrate.measurements.observation import Block, Observation, Table
-from calibrate.measurements.registry import OBSERVATIONS
-from calibrate.measurements.tables import DataTable, open_data, write_csv, write_netcdf
+from calibrate.measurements.tables import (
+    TEXT,
+    DataTable,
+    read_csv,
+    read_netcdf,
+    write_csv,
+    write_netcdf,
+)
 from calibrate.state_names import in_state, split
 from emulator.core.errors import InputError
 from emulator.scenes.scene import Scene
 
+_SPREADSHEETS = (".xlsx", ".xls", ".ods")
+
+Reader = Callable[[Path], Mapping[str, DataTable]]
+"""Maps a file to the table of each of its load states."""
+
 Files = str | Path | Mapping[str, str]
 """A data file, or the file of each load state by the state's name."""
-
-
-def read_data(scene: Scene, files: Files) -> tuple[Observations, dict[str, np.ndarray]]:
-    """Return the observations of a file and their data; see :func:`read_measurements`."""
-    observe, data, _ = read_measurements(scene, files)
-    return observe, data
 
 
 def read_measurements(
@@ -65,50 +70,49 @@ def read_measurements(
     parts: dict[str, Observation] = {}
     data: dict[str, np.ndarray] = {}
     known: dict[str, float] = {}
-    distinct: dict[str, Observation] = {}
-    for path, state, file in _states(files):
-        known |= {in_state(parameter, state): value for parameter, value in file.known().items()}
-        tables = _tables(path, file)
-        for base, (kind, table) in tables.items():
-            name = in_state(base, state)
-            arrays = file.arrays(table.fields, _others(table, [t for _, t in tables.values()]))
-            try:
-                part, data[name] = kind.read(scene, base, table, arrays)
-                # One object for all states in which the same was observed: one program for them.
-                parts[name] = distinct.setdefault(json.dumps(part.to_json()), part)
-                parts[name].check(name, data[name])
-                check_some(base, data[name])
-            except InputError as error:
-                where = f", state '{state}'" if state else ""
-                raise InputError(f"data file {path}{where}: {error}") from error
+    paths: Mapping[str, str | Path] = files if isinstance(files, Mapping) else {"": files}
+    for given, path in paths.items():
+        if paths is files and (not given or set("@/+") & set(given)):
+            raise InputError(f"data: load state '{given}'; give it a name without @, / and +")
+        file = Path(path)
+        if not file.is_file():
+            raise InputError(f"data file {path} does not exist")
+        if file.suffix.lower() in _SPREADSHEETS:
+            raise InputError(f"data file {path} is a spreadsheet; save it as CSV")
+        read: Reader = read_csv if file.suffix.lower() in TEXT else read_netcdf
+        for own, table in read(file).items():
+            state = ".".join(filter(None, (given, own)))
+            known |= {in_state(name, state): value for name, value in table.known.items()}
+            for name, (part, values) in _observed(scene, table, state).items():
+                parts[name], data[name] = part, values
     return Observations(parts), data, known
 
 
-def _states(files: Files) -> Iterator[tuple[Path, str, DataTable]]:
-    """Yield the path, load state and content of each file and state."""
-    if not isinstance(files, Mapping):
-        for state, table in open_data(Path(files)).states().items():
-            yield Path(files), state, table
-        return
-    for name, file in files.items():
-        if not name or set("@/+") & set(name):
-            raise InputError(f"data: load state '{name}'; give it a name without @, / and +")
-        for state, table in open_data(Path(file)).states().items():
-            yield Path(file), f"{name}.{state}" if state else name, table
+def _observed(
+    scene: Scene, file: DataTable, state: str
+) -> dict[str, tuple[Observation, np.ndarray]]:
+    """Return the observations of one load state and their data, by name."""
+    tables, found = _tables(file), {}
+    for base, (kind, table) in tables.items():
+        name, places = in_state(base, state), _words(table, where=True)
+        sharing = [t for _, t in tables.values() if places & _words(t, where=True)]
+        others = {w for t in sharing if t is not table for w in _words(t, where=False)}
+        arrays = file.arrays(table.fields, others)
+        try:
+            part, values = found[name] = kind.read(scene, base, table, arrays)
+            part.check(name, values)
+            check_some(base, values)
+        except InputError as error:
+            where = f", state '{state}'" if state else ""
+            raise InputError(f"data file {file.path}{where}: {error}") from error
+    return found
 
 
-def _others(table: Table, tables: Iterable[Table]) -> set[str]:
-    """Return the columns of other observations that share columns of places with ``table``."""
-    places = _columns(table, where=True)
-    sharing = (t for t in tables if t is not table and places & _columns(t, where=True))
-    return {word for other in sharing for word in _columns(other, where=False)}
-
-
-def _columns(table: Table, *, where: bool) -> set[str]:
+def _words(table: Table, *, where: bool) -> set[str]:
     return {word for field in table.fields if field.where is where for word in field.columns}
 
 
-def _tables(path: Path, file: DataTable) -> dict[str, tuple[type[Observation], Table]]:
+def _tables(file: DataTable) -> dict[str, tuple[type[Observation], Table]]:
     """Return kind and table of each observation that the file has all columns of, by name."""
     complete: dict[str, tuple[type[Observation], Table]] = {}
     partial: list[list[str]] = []
@@ -123,21 +127,16 @@ def _tables(path: Path, file: DataTable) -> dict[str, tuple[type[Observation], T
                 used.update(words)
     # An incomplete observation is refused; otherwise its columns would be silently ignored.
     partial = [words for words in partial if set(words) & set(file.words) - used]
-    if partial or not complete:
-        lacking = [[w for w in words if w not in file.words] for words in partial]
-        fault = f"{file.what} '{min(lacking, key=len)[0]}' is missing" if partial else "no data"
-        raise InputError(f"data file {path}: {fault}; expected {_expected(file)}")
-    return complete
-
-
-def _expected(file: DataTable) -> str:
-    """Return the columns or variables of every kind, for error messages."""
-    every = [
+    if complete and not partial:
+        return complete
+    lacking = [[w for w in words if w not in file.words] for words in partial]
+    fault = f"{file.what} '{min(lacking, key=len)[0]}' is missing" if partial else "no data"
+    every = " or ".join(
         ",".join(word for field in table.fields for word in file.words_of(field))
         for name, kind in OBSERVATIONS.items()
         for table in kind.tables((name,)).values()
-    ]
-    return f"{file.what}s {' or '.join(every)}"
+    )
+    raise InputError(f"data file {file.path}: {fault}; expected {file.what}s {every}")
 
 
 def write_data(

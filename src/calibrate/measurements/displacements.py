@@ -20,19 +20,33 @@ import numpy as np
 
 from calibrate.measurements.location import locate
 from calibrate.measurements.observation import LENGTH_UNITS, Field, Scalar
-from calibrate.measurements.points import (
-    DISPLACEMENT,
-    XYZ,
-    DisplacementPoints,
-    as_points,
-    check_distinct,
-    gather,
-)
+from calibrate.measurements.points import XYZ, DisplacementPoints, as_points, gather
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import shapes_at
 from emulator.scenes.scene import Scene, all_nodes, check_nodes
 
 _SHORTEST = 1e-6  # in sizes of the body; the direction of a shorter length is round-off
+
+
+def spread_nodes(scene: Scene, count: int, seed: int) -> np.ndarray:
+    """Return ``count`` nodes drawn without replacement from those with a free component, sorted."""
+    candidates = np.flatnonzero(~scene.held.all(axis=1))
+    if not 0 < count <= len(candidates):
+        raise InputError(
+            f"cannot observe {count} nodes; scene '{scene.name}' has {len(candidates)} free"
+        )
+    return np.sort(np.random.default_rng(seed).choice(candidates, count, replace=False))
+
+
+def spread_landmarks(scene: Scene, count: int, seed: int) -> np.ndarray:
+    """Return ``count`` points (count, 3) mm, uniform over the volume of the reference body."""
+    rng = np.random.default_rng(seed)
+    volumes = scene.discretisation.weights.sum(axis=1)
+    elements = rng.choice(len(volumes), count, p=volumes / volumes.sum())
+    # Uniform in the reference element: uniform in an element with straight edges.
+    barycentric = rng.dirichlet(np.ones(4), count)
+    weights, _ = shapes_at(scene.mesh.order, barycentric)
+    return np.einsum("da,dai->di", weights, scene.mesh.nodes[scene.mesh.elements[elements]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +60,7 @@ class NodalDisplacements(DisplacementPoints):
     usage = "nodes:N, all, a node set, node numbers like 3,14,15"
     arguments = ("nodes",)
     place_field = Field("node", ("node",), where=True)
+    spread = staticmethod(spread_nodes)
 
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the displacements themselves."""
@@ -63,7 +78,12 @@ class NodalDisplacements(DisplacementPoints):
         if isinstance(nodes, str):
             index = all_nodes(scene) if nodes == "all" else scene.mesh.node_set(nodes)
         else:
-            index = check_nodes(scene, np.asarray(nodes))
+            index = np.asarray(nodes)
+            if index.dtype == float:  # as files have them
+                if (index != np.round(index)).any():
+                    raise InputError("nodes must be whole numbers")
+                index = index.astype(int)
+            index = check_nodes(scene, index)
         numbers, counts = np.unique(index, return_counts=True)
         if (counts > 1).any():
             raise InputError(
@@ -72,32 +92,16 @@ class NodalDisplacements(DisplacementPoints):
             )
         return cls(index, scene.mesh.nodes[index])
 
-    @classmethod
-    def spread(cls, scene: Scene, selection: str, count: int, seed: int) -> np.ndarray:
-        """Return nodes with a free component."""
-        return spread_nodes(scene, count, seed)
 
-    @classmethod
-    def parse(cls, scene: Scene, word: str, seed: int) -> tuple[str, Self] | None:
-        """Read ``nodes:N`` (N random free nodes), ``all``, a node set, or node numbers."""
-        if word == "all" or word in scene.mesh.node_sets:
-            return DISPLACEMENT, cls.of(scene, word)
-        if word.partition(":")[0] == cls.kind:
-            return super().parse(scene, word, seed)
-        try:
-            numbers = [int(text) for text in word.split(",")]
-        except ValueError:
-            return None
-        return DISPLACEMENT, cls.of(scene, numbers)
-
-    @classmethod
-    def located(
-        cls, scene: Scene, selection: tuple[Any, ...], places: np.ndarray, values: np.ndarray
-    ) -> Self:
-        """Return the observation of the nodes that a file numbers."""
-        if (places != np.round(places)).any():
-            raise InputError("nodes must be whole numbers")
-        return cls.of(scene, places.astype(int))
+def nodes_called(scene: Scene, word: str) -> NodalDisplacements | None:
+    """Return the observation of ``all`` nodes, a node set or numbers; None for other words."""
+    if word == "all" or word in scene.mesh.node_sets:
+        return NodalDisplacements.of(scene, word)
+    try:
+        numbers = [int(text) for text in word.split(",")]
+    except ValueError:
+        return None
+    return NodalDisplacements.of(scene, numbers)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +123,7 @@ class Landmarks(DisplacementPoints):
     usage = "landmarks:N"
     arguments = ("points",)
     place_field = Field("position", XYZ, where=True)
+    spread = staticmethod(spread_landmarks)
 
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
         """Return interpolated displacements (..., d, 3)."""
@@ -134,16 +139,10 @@ class Landmarks(DisplacementPoints):
         InputError
             A point that lies neither in an element nor just beside one, or is given twice.
         """
-        points = as_points(points, "landmarks have shape {}; expected (d, 3), finite, in mm")
-        check_distinct(points, "landmarks")
-        elements, weights = locate(scene.mesh, points)
+        points = as_points(points, "landmarks")
+        elements, inside = locate(scene.mesh, points)
         nodes, members = gather(scene.mesh.elements[elements])
-        return cls(nodes, points, members, weights)
-
-    @classmethod
-    def spread(cls, scene: Scene, selection: str, count: int, seed: int) -> np.ndarray:
-        """Return points that are uniform over the volume."""
-        return spread_landmarks(scene, count, seed)
+        return cls(nodes, points, members, shapes_at(scene.mesh.order, inside)[0])
 
     @classmethod
     def located(
@@ -159,6 +158,16 @@ class Landmarks(DisplacementPoints):
                     "rest"
                 ) from error
             raise
+
+
+def _are_deformed(scene: Scene, points: np.ndarray, values: np.ndarray) -> bool:
+    """Return whether points (d, 3) lie in the body only once displacements are subtracted."""
+    measured = np.isfinite(values).all(axis=1)
+    try:
+        locate(scene.mesh, points[measured] - values[measured])
+    except InputError:
+        return False
+    return bool(measured.any())
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,37 +231,6 @@ landmarks = Landmarks.of
 length_between = Length.of
 
 
-def spread_nodes(scene: Scene, count: int, seed: int) -> np.ndarray:
-    """Return ``count`` nodes drawn without replacement from those with a free component, sorted."""
-    candidates = np.flatnonzero(~scene.held.all(axis=1))
-    if not 0 < count <= len(candidates):
-        raise InputError(
-            f"cannot observe {count} nodes; scene '{scene.name}' has {len(candidates)} free"
-        )
-    return np.sort(np.random.default_rng(seed).choice(candidates, count, replace=False))
-
-
-def spread_landmarks(scene: Scene, count: int, seed: int) -> np.ndarray:
-    """Return ``count`` points (count, 3) mm, uniform over the volume of the reference body."""
-    rng = np.random.default_rng(seed)
-    volumes = scene.discretisation.weights.sum(axis=1)
-    elements = rng.choice(len(volumes), count, p=volumes / volumes.sum())
-    # Uniform in the reference element: uniform in an element with straight edges.
-    barycentric = rng.dirichlet(np.ones(4), count)
-    weights, _ = shapes_at(scene.mesh.order, barycentric)
-    return np.einsum("da,dai->di", weights, scene.mesh.nodes[scene.mesh.elements[elements]])
-
-
-def _are_deformed(scene: Scene, points: np.ndarray, values: np.ndarray) -> bool:
-    """Return whether points (d, 3) lie in the body only once displacements are subtracted."""
-    measured = np.isfinite(values).all(axis=1)
-    try:
-        locate(scene.mesh, points[measured] - values[measured])
-    except InputError:
-        return False
-    return bool(measured.any())
-
-
 def _landmark(scene: Scene, text: str) -> tuple[np.ndarray, np.ndarray]:
     """Return nodes and weights of a landmark."""
     if text in scene.mesh.node_sets:
@@ -263,8 +241,8 @@ def _landmark(scene: Scene, text: str) -> tuple[np.ndarray, np.ndarray]:
     except ValueError:
         numbers = []
     if len(numbers) == 3 and np.isfinite(numbers).all():
-        elements, shapes = locate(scene.mesh, np.array([numbers]))
-        return scene.mesh.elements[elements[0]], shapes[0]
+        elements, inside = locate(scene.mesh, np.array([numbers]))
+        return scene.mesh.elements[elements[0]], shapes_at(scene.mesh.order, inside)[0][0]
     if len(numbers) == 1 and text.isdigit():
         return check_nodes(scene, np.array([int(text)])), np.ones(1)
     known = ", ".join(sorted(scene.mesh.node_sets)) or "none here"

@@ -47,7 +47,7 @@ from emulator.scenes.scene import Scene, inflated_cavity
 PRESSURE_SCATTER = 3.0 * KPA_PER_MMHG
 """Upper bound of the published root mean square errors of pressure, kPa."""
 
-_A, _B = 27.78 * KPA_PER_MMHG, 2.76
+_B = 2.76
 _UNLOADED, _SLOPE = 0.6, 0.006 / KPA_PER_MMHG  # V_0 / V_m at rest, and its fall with P_m in 1/kPa
 _LARGEST = 40.0 * KPA_PER_MMHG  # largest pressure at which the relation was compared
 
@@ -56,8 +56,6 @@ _LARGEST = 40.0 * KPA_PER_MMHG  # largest pressure at which the relation was com
 class Klotz:
     """The relation through one point; differentiable in it.
 
-    Parameters
-    ----------
     measured_volume : the measured volume V_m, mL.
     measured_pressure : the pressure P_m at which it was measured, kPa, above 0 and up to 5.33
         (40 mmHg).
@@ -89,12 +87,6 @@ class Klotz:
         """V_0 in mL, the volume without pressure."""
         volume, pressure = self._point
         return volume * (_UNLOADED - _SLOPE * pressure)
-
-    @property
-    def at_30_mmhg(self) -> jax.Array:
-        """V_30 in mL, where the normalised curve reaches A_n = 27.78 mmHg."""
-        volume, pressure = self._point
-        return self.unloaded + (volume - self.unloaded) * (pressure / _A) ** (-1.0 / _B)
 
     def volume(self, pressure: ArrayLike) -> jax.Array:
         """Return the volume (...) in mL at ``pressure`` (...) in kPa; V_0 at 0 kPa or less."""
@@ -145,8 +137,6 @@ class KlotzVolume(Scalar):
     pressure in the observation's load state. Where the two pressures agree, it is the volume.
     The relation's scatter in mL depends on the pressure (:meth:`Klotz.sd`), so its noise is given.
 
-    Parameters
-    ----------
     scene : the scene, with such a cavity.
     measured_pressure : P_m in kPa, at which the data were measured.
     volume, column : the volume of the cavity and the column of its pressure in theta, derived.

@@ -12,8 +12,6 @@ where the foot lies outside, the closest point of the three edges. On curved fac
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from skfem import MeshTet
 
@@ -35,31 +33,10 @@ _GAUSS_NEWTON_STEPS = 20  # the distance of a point on the surface converges qua
 
 
 def locate(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the element (d,) of each point (d, 3), and its shape functions there (d, 4 or 10).
+    """Return the element (d,) of each point (d, 3) and its barycentric coordinates there, (d, 4).
 
-    Raises
-    ------
-    InputError
-        A point further outside than a thousandth of the body's size.
+    :class:`InputError` for a point further outside than a thousandth of the body's size.
     """
-    elements, inside = _find(mesh, points)
-    return elements, shapes_at(mesh.order, inside)[0]
-
-
-def locate_gradients(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the element (d,) of each point (d, 3), barycentric coordinates (d, 4) and gradients.
-
-    The gradients are those of the shape functions in the reference body, (d, 4 or 10, 3) in 1/mm.
-    """
-    elements, inside = _find(mesh, points)
-    _, slopes = shapes_at(mesh.order, inside)
-    jacobian = np.einsum("dai,daj->dij", mesh.nodes[mesh.elements[elements]], slopes)
-    # NumPy inverts the matrices, because JAX's batched LAPACK is slow on small ones.
-    return elements, inside, np.einsum("daj,dji->dai", slopes, np.linalg.inv(jacobian))
-
-
-def _find(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the element (d,) of each point and its barycentric coordinates there, (d, 4)."""
     _check_extent(mesh, points)
     straight = MeshTet(mesh.nodes.T.copy(), mesh.corners.T.copy(), sort_t=False, validate=False)
     finder, nodes = straight.element_finder(), mesh.nodes[mesh.elements]
@@ -76,6 +53,14 @@ def _find(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         elements.append(int(element[0]))
         coordinates.append(inside[0])
     return np.array(elements), np.array(coordinates)
+
+
+def gradients_at(mesh: Mesh, elements: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """Return reference gradients (d, 4 or 10, 3) of the shape functions, 1/mm, as located."""
+    _, slopes = shapes_at(mesh.order, inside)
+    jacobian = np.einsum("dai,daj->dij", mesh.nodes[mesh.elements[elements]], slopes)
+    # NumPy inverts the matrices, because JAX's batched LAPACK is slow on small ones.
+    return np.einsum("daj,dji->dai", slopes, np.linalg.inv(jacobian))
 
 
 def _check_extent(mesh: Mesh, points: np.ndarray) -> None:
@@ -151,31 +136,18 @@ def _onto(X: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.linalg.norm(positions - point, axis=1), inside
 
 
-class SurfacePoint(NamedTuple):
-    """A point of a surface.
+def closest_point(facets: np.ndarray, point: np.ndarray) -> tuple[int, np.ndarray]:
+    """Return the facet closest to ``point`` (3,), and the closest point's barycentric (3,) there.
 
-    facet : the row of its facet.
-    weights : shape functions of the facet there, (3,), or (6,) where it is quadratic.
-    position : the position, mm, (3,).
-    normal : the unit normal out of the tissue, (3,).
+    ``facets`` (f, 3 or 6, 3) are the positions of the nodes of linear or quadratic facets, mm.
     """
-
-    facet: int
-    weights: np.ndarray
-    position: np.ndarray
-    normal: np.ndarray
-
-
-def closest_point(facets: np.ndarray, point: np.ndarray) -> SurfacePoint:
-    """Return the point closest to ``point`` (3,) on ``facets`` (f, 3 or 6, 3), their nodes, mm."""
     coordinates, distances = _onto_triangles(facets[:, :3], point)
+    candidates = np.arange(len(facets))
     if facets.shape[1] == 6:
         candidates = np.argsort(distances, kind="stable")[:_FACETS]
-        inside, distances = _onto_curved(facets[candidates], coordinates[candidates], point)
-        best = int(np.argmin(distances))
-        return _surface_point(facets, int(candidates[best]), inside[best])
+        coordinates, distances = _onto_curved(facets[candidates], coordinates[candidates], point)
     best = int(np.argmin(distances))
-    return _surface_point(facets, best, coordinates[best])
+    return int(candidates[best]), coordinates[best]
 
 
 def facet_shapes(barycentric: np.ndarray, nodes: int) -> tuple[np.ndarray, np.ndarray]:
@@ -193,14 +165,6 @@ def facet_shapes(barycentric: np.ndarray, nodes: int) -> tuple[np.ndarray, np.nd
     corners = (4.0 * L - 1.0)[:, :, None] * along
     middles = 4.0 * (L[:, i, None] * along[j] + L[:, j, None] * along[i])
     return values, np.concatenate([corners, middles], axis=1)
-
-
-def _surface_point(facets: np.ndarray, facet: int, barycentric: np.ndarray) -> SurfacePoint:
-    values, slopes = facet_shapes(barycentric[None], facets.shape[1])
-    tangents = slopes[0].T @ facets[facet]
-    normal = np.cross(tangents[0], tangents[1])
-    position = values[0] @ facets[facet]
-    return SurfacePoint(facet, values[0], position, normal / np.linalg.norm(normal))
 
 
 def _onto_triangles(corners: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

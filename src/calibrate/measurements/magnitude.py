@@ -20,7 +20,7 @@ may be small.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 
 import jax
@@ -78,36 +78,28 @@ def predict_over_prior(
     The ends are taken one unknown at a time, and then together where each makes the prediction
     smaller, or larger.
 
-    Raises
-    ------
-    InputError
-        The forward map has no valid answer at any of them.
+    :class:`InputError` where the forward map has no valid answer at any of them.
     """
-    one = jax.jit(predict)
+    one, columns = jax.jit(predict), np.arange(draws.shape[1])
     predictions: dict[str, list[np.ndarray]] = {name: [] for name in observe.parts}
 
-    def sizes(values: np.ndarray) -> dict[str, float]:
-        means, valid = one(jnp.asarray(values))
-        if not bool(valid):
-            return dict.fromkeys(predictions, np.nan)
-        for name, mean in means.items():
-            predictions[name].append(np.asarray(mean))
-        return {name: _norm(np.asarray(mean)) for name, mean in means.items()}
+    def sizes(rows: Iterable[np.ndarray]) -> dict[str, list[float]]:
+        """Add the predictions at ``rows`` and return their norms, NaN where there is none."""
+        norms: dict[str, list[float]] = {name: [] for name in predictions}
+        for row in rows:
+            means, valid = one(jnp.asarray(row))
+            for name, mean in means.items():
+                norms[name].append(_norm(np.asarray(mean)) if bool(valid) else np.nan)
+                predictions[name] += [np.asarray(mean)] if bool(valid) else []
+        return norms
 
+    sizes(draws[:_DRAWS])
     middle, ends = np.median(draws, axis=0), np.stack([draws.min(axis=0), draws.max(axis=0)])
-    for values in draws[:_DRAWS]:
-        sizes(values)
-    at_ends = {name: np.empty(ends.shape) for name in predictions}
-    for end, k in np.ndindex(ends.shape):
-        values = middle.copy()
-        values[k] = ends[end, k]
-        for name, size in sizes(values).items():
-            at_ends[name][end, k] = size
-    columns = np.arange(ends.shape[1])
-    for low, high in at_ends.values():
+    one_by_one = np.where(np.eye(len(columns), dtype=bool), ends[:, None], middle)
+    for norms in sizes(one_by_one.reshape(-1, len(columns))).values():
+        low, high = np.reshape(norms, ends.shape)
         smaller = (high < low).astype(int)
-        sizes(ends[smaller, columns])
-        sizes(ends[1 - smaller, columns])
+        sizes([ends[smaller, columns], ends[1 - smaller, columns]])
     if not all(predictions.values()):
         raise InputError(
             f"the forward map has no valid answer at any of {_DRAWS} draws of the prior; "

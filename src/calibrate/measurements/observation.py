@@ -2,9 +2,9 @@
 
 A kind of observation declares constants (its name, words, unit and columns), makes itself from a
 scene (``of``) and predicts its numbers (``evaluate``). Command-line words, JSON, shape, labels,
-missing values and columns of data files follow from the declaration: for single numbers in
-:class:`Scalar`, for numbers at places in :mod:`calibrate.measurements.points`. A new kind is a file
-beside this one and a line in :mod:`calibrate.measurements.registry`.
+missing values and columns of data files follow from the declaration: of a single number here, of
+numbers at places in :mod:`calibrate.measurements.points`. A new kind is a file beside this one and
+a line in :data:`calibrate.measurements.OBSERVATIONS`.
 
 Leaving a missing entry out is exact. With entries m missing and p present, the likelihood of what
 was measured is the integral of p(y_p, y_m | theta) over y_m, which for independent noise drops the
@@ -29,9 +29,6 @@ from emulator.scenes.scene import Scene
 
 LENGTH_UNITS: Mapping[str, float] = {"m": 1e3, "cm": 10.0, "µm": 1e-3}
 """Units that lengths in mm may come in by mistake, each in mm."""
-
-ENTRIES = "present"
-"""Key of the entries that are not missing, in an observation's JSON."""
 
 
 class Field(NamedTuple):
@@ -67,31 +64,27 @@ Block = Sequence[tuple[Field, np.ndarray]]
 """The fields of one observation with their arrays."""
 
 
-class Labels(NamedTuple):
-    """How an observation's data is labelled in the DataTree.
-
-    dims : dimensions of each array, by the array's name.
-    coords : values of each dimension.
-    constants : arrays that go with the data, such as reference positions.
-    """
-
-    dims: Mapping[str, list[str]] = {}
-    coords: Mapping[str, Any] = {}
-    constants: Mapping[str, np.ndarray] = {}
+Labels = tuple[dict[str, np.ndarray], dict[str, list[str]], dict[str, Any]]
+"""How data is labelled in the DataTree: arrays that go with it, such as reference positions; the
+dimensions of each array, by the array's name; the values of each dimension."""
 
 
 class Observation(ABC):
     """Measured numbers as a function of the displacement of a few nodes, and of theta.
 
-    A kind is a frozen dataclass that declares
+    What is here is one number, in a column called as on the command line,
+    ``kind:argument:argument``. A kind is a frozen dataclass that declares
 
     kind : its name in the registry, in JSON and on the command line.
     usage : the words that ask for it, for help and errors.
     hint : the text that an error adds to the usage.
+    arguments : the names of the arguments of ``of`` after the scene, which are text and attributes
+        of the observation, too.
     quantity : the measured quantity, such as ``displacement``.
     unit : the unit of the data; ``1`` where it has none.
     other_units : units the data may be in by mistake, each with the factor that converts it.
     usual_sd : the standard deviation of the noise where none is given; None if it must be given.
+    positive : whether the number must be above 0.
     nodes : the nodes whose displacement it needs, (k,).
 
     and has ``entries`` (n,), the positions in the raveled data that are not missing, ascending;
@@ -101,16 +94,18 @@ class Observation(ABC):
     kind: ClassVar[str]
     usage: ClassVar[str]
     hint: ClassVar[str] = ""
+    arguments: ClassVar[tuple[str, ...]]
     quantity: ClassVar[str]
     usual_sd: ClassVar[float | None] = None
+    positive: ClassVar[bool] = True
     unit: str
-    other_units: Mapping[str, float]
+    other_units: Mapping[str, float] = {}
     nodes: np.ndarray
     entries: np.ndarray | None = None
 
     @abstractmethod
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
-        """Return the data without noise and without gaps (..., *full_shape), in one load state.
+        """Return the data without noise and without gaps, (..., *shape), in one load state.
 
         Parameters
         ----------
@@ -119,124 +114,91 @@ class Observation(ABC):
         """
 
     @classmethod
-    @abstractmethod
     def of(cls, scene: Scene, *arguments: Any, **options: Any) -> Self:
         """Return the observation of ``scene`` that the arguments describe, as text or arrays."""
-
-    @classmethod
-    @abstractmethod
-    def parse(cls, scene: Scene, word: str, seed: int) -> tuple[str, Self] | None:
-        """Return the name and the observation that ``word`` of the command line asks for.
-
-        The result is None if the word is of another kind. Random places are drawn from ``seed``.
-        """
-
-    @classmethod
-    @abstractmethod
-    def from_json(cls, scene: Scene, description: Mapping[str, Any]) -> Self:
-        """Return the observation that :meth:`to_json` described, without gaps."""
-
-    @abstractmethod
-    def described(self) -> Mapping[str, Any]:
-        """Return the plain JSON that :meth:`from_json` reads."""
-
-    @classmethod
-    @abstractmethod
-    def tables(cls, words: Collection[str]) -> dict[str, Table]:
-        """Return the tables of this kind's observations, by the observation's name.
-
-        ``words`` are the columns or variables of a file; some that a table needs may be missing.
-        """
-
-    @classmethod
-    @abstractmethod
-    def read(
-        cls, scene: Scene, name: str, table: Table, arrays: Mapping[str, np.ndarray]
-    ) -> tuple[Self, np.ndarray]:
-        """Return the observation called ``name`` and its data, from the arrays of its table."""
-
-    @abstractmethod
-    def block(self, name: str, values: np.ndarray) -> Block:
-        """Return the arrays that hold ``values``, without gaps, in a data file."""
+        return cls(scene, *arguments)  # type: ignore[call-arg]
 
     @property
-    @abstractmethod
     def names(self) -> tuple[str, ...]:
         """The observation's possible names in a data file; the first one where it is alone."""
+        return (":".join([self.kind, *(str(getattr(self, a)) for a in self.arguments)]),)
 
     @property
-    @abstractmethod
-    def full_shape(self) -> tuple[int, ...]:
-        """Shape of the data without gaps."""
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the data; (n,) where entries are missing."""
+        return ()
 
     @property
-    def full_sites(self) -> Sites | None:
-        """The position of each number without gaps; None for what has no one position."""
+    def missing(self) -> int:
+        """Number of entries left out."""
+        return 0
+
+    @property
+    def sites(self) -> Sites | None:
+        """The position of each number of the data; None for what has no one position."""
         return None
 
-    def full_labels(self, name: str) -> Labels:
-        """Return labels of the data without gaps if the observation is called ``name``."""
-        return Labels()
+    def labels(self, name: str) -> Labels:
+        """Return the labels of the data called ``name`` in the DataTree."""
+        return {}, {}, {}
 
-    @abstractmethod
-    def check_values(self, name: str, values: np.ndarray) -> None:
-        """Raise :class:`InputError` if a value of the data without gaps is impossible."""
+    @classmethod
+    def parse(cls, scene: Scene, word: str, seed: int) -> tuple[str, Self]:
+        """Return the name and the observation that ``word`` of the command line asks for.
+
+        The word begins with the kind. Random places are drawn from ``seed``.
+        """
+        rest = word.partition(":")[2]
+        texts = rest.split(":") if len(cls.arguments) > 1 else [rest]
+        if (len(texts) > 1 and not all(texts)) or len(texts) != len(cls.arguments):
+            raise cls.misuse(word)
+        try:
+            return word, cls.of(scene, *texts)
+        except InputError:
+            raise
+        except ValueError:  # text that is no number
+            raise cls.misuse(word) from None
 
     @classmethod
     def misuse(cls, word: str) -> InputError:
         """Return the error for a word of this kind that it cannot read."""
         return InputError(f"observe '{word}': give {cls.usage}{cls.hint}")
 
-    @property
-    def default_noise(self) -> GaussianNoise:
-        """The noise of an observation that names none; :class:`InputError` if it must."""
-        if self.usual_sd is None:
-            name = self.names[0]
-            raise InputError(f"{name} has no usual noise; give --noise {name}=SD, in {self.unit}")
-        return GaussianNoise(sd=self.usual_sd)
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON from which the registry makes the observation again."""
+        return {"kind": self.kind, "word": self.names[-1]}
 
-    @property
-    def whole(self) -> Self:
-        """The observation without gaps."""
-        return self.restricted(None)
+    @classmethod
+    def from_json(cls, scene: Scene, description: Mapping[str, Any]) -> Self:
+        """Return the observation that :meth:`to_json` described."""
+        return cls.parse(scene, description["word"], 0)[1]
 
-    def restricted(self, entries: np.ndarray | None) -> Self:
-        """Return the observation of ``entries`` alone, or of all for None."""
-        part = copy(self)  # unlike `replace`, `copy` keeps what the observation has computed
-        part._derive(entries=entries)
-        return part
+    @classmethod
+    def tables(cls, words: Collection[str]) -> dict[str, Table]:
+        """Return the tables of this kind's observations, by the observation's name.
 
-    def _derive(self, **attributes: Any) -> None:
-        """Set attributes that follow from the fields; for ``__post_init__``."""
-        for name, value in attributes.items():
-            object.__setattr__(self, name, value)
+        ``words`` are the columns or variables of a file; some that a table needs may be missing.
+        """
+        own = (word for word in words if word.partition(":")[0] == cls.kind)
+        return {word: Table((), (Field(word, (word,)),)) for word in own}
 
-    @property
-    def missing(self) -> int:
-        """Number of entries left out."""
-        size = int(np.prod(self.full_shape, dtype=int))
-        return 0 if self.entries is None else size - len(self.entries)
+    @classmethod
+    def read(
+        cls, scene: Scene, name: str, table: Table, arrays: Mapping[str, np.ndarray]
+    ) -> tuple[Self, np.ndarray]:
+        """Return the observation called ``name`` and its data, from the arrays of its table."""
+        _, part = cls.parse(scene, name, 0)
+        if arrays[name].size != 1:
+            raise InputError(f"{name} has {arrays[name].size} values; give one, in {part.unit}")
+        return part, arrays[name].reshape(())
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Shape of the data: ``full_shape``, or (n,) where entries are missing."""
-        return self.full_shape if self.entries is None else self.entries.shape
-
-    def __call__(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
-        """Return the data without noise (..., *shape), from one load state; see ``evaluate``."""
-        values = self.evaluate(displacement, theta)
-        if self.entries is None:
-            return values
-        batch = values.shape[: values.ndim - len(self.full_shape)]
-        return values.reshape(*batch, -1)[..., self.entries]
+    def block(self, name: str, values: np.ndarray) -> Block:
+        """Return the arrays that hold ``values`` in a data file, NaN where they are missing."""
+        return [(Field(name, (name,)), np.asarray(values))]
 
     def filled(self, values: np.ndarray) -> np.ndarray:
-        """Return ``values`` (*shape) as data without gaps (*full_shape), NaN where missing."""
-        if self.entries is None:
-            return np.asarray(values)
-        filled = np.full(int(np.prod(self.full_shape, dtype=int)), np.nan)
-        filled[self.entries] = values
-        return filled.reshape(self.full_shape)
+        """Return ``values`` (*shape) as data without gaps, NaN where missing."""
+        return np.asarray(values)
 
     def check(self, name: str, values: np.ndarray) -> None:
         """Raise :class:`InputError` on data of a wrong shape or with impossible values.
@@ -251,110 +213,36 @@ class Observation(ABC):
             )
         self.check_values(name, self.filled(values))
 
-    @property
-    def sites(self) -> Sites | None:
-        """The position of each number of the data; None for what has no one position."""
-        sites = self.full_sites
-        if sites is None or self.entries is None:
-            return sites
-        return Sites(sites.positions[self.entries], sites.component[self.entries])
-
-    def labels(self, name: str) -> Labels:
-        """Return the data's labels; entries with gaps are numbered as in the raveled data."""
-        labels = self.full_labels(name)
-        if self.entries is None:
-            return labels
-        entry = f"entry_{name}"
-        coords = {**labels.coords, entry: self.entries}
-        return Labels({**labels.dims, name: [entry]}, coords, labels.constants)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return plain JSON from which the registry makes the observation again."""
-        gaps = {} if self.entries is None else {ENTRIES: self.entries.tolist()}
-        return {"kind": self.kind, **self.described(), **gaps}
-
-
-class Scalar(Observation):
-    """One number, in a column called as on the command line: ``kind:argument:argument``.
-
-    A kind declares ``arguments``, the names of the arguments of ``of`` after the scene, which are
-    text and attributes of the observation, too; and whether the number must be above 0.
-    """
-
-    arguments: ClassVar[tuple[str, ...]]
-    positive: ClassVar[bool] = True
-    other_units: Mapping[str, float] = {}
-
-    @property
-    def full_shape(self) -> tuple[int, ...]:
-        """``()``."""
-        return ()
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The kind and the arguments, joined by colons."""
-        return (":".join([self.kind, *(str(getattr(self, a)) for a in self.arguments)]),)
-
-    @classmethod
-    def of(cls, scene: Scene, *arguments: Any, **options: Any) -> Self:
-        """Return the observation by its own constructor."""
-        return cls(scene, *arguments)  # type: ignore[call-arg]
-
-    @classmethod
-    def parse(cls, scene: Scene, word: str, seed: int) -> tuple[str, Self] | None:
-        """Read ``kind:argument:argument``; the word is the observation's name."""
-        kind, _, rest = word.partition(":")
-        if kind != cls.kind:
-            return None
-        texts = rest.split(":") if len(cls.arguments) > 1 else [rest]
-        if (len(texts) > 1 and not all(texts)) or len(texts) != len(cls.arguments):
-            raise cls.misuse(word)
-        try:
-            return word, cls.of(scene, *texts)
-        except InputError:
-            raise
-        except ValueError:  # text that is no number
-            raise cls.misuse(word) from None
-
-    def described(self) -> dict[str, Any]:
-        """Return the word that asks for the observation."""
-        return {"word": self.names[-1]}
-
-    @classmethod
-    def from_json(cls, scene: Scene, description: Mapping[str, Any]) -> Self:
-        """Return the observation that the word asks for."""
-        return cls._of_word(scene, description["word"])
-
-    @classmethod
-    def tables(cls, words: Collection[str]) -> dict[str, Table]:
-        """Return one column for each word ``<kind>`` or ``<kind>:...``."""
-        own = (word for word in words if word.partition(":")[0] == cls.kind)
-        return {word: Table((), (Field(word, (word,)),)) for word in own}
-
-    @classmethod
-    def read(
-        cls, scene: Scene, name: str, table: Table, arrays: Mapping[str, np.ndarray]
-    ) -> tuple[Self, np.ndarray]:
-        """Return the observation and its number, from the one array called ``name``."""
-        part = cls._of_word(scene, name)
-        if arrays[name].size != 1:
-            raise InputError(f"{name} has {arrays[name].size} values; give one, in {part.unit}")
-        return part, arrays[name].reshape(())
-
-    def block(self, name: str, values: np.ndarray) -> Block:
-        """Return the number under the observation's name."""
-        return [(Field(name, (name,)), np.asarray(values))]
-
     def check_values(self, name: str, values: np.ndarray) -> None:
-        """Refuse an infinite number, and one that is not above 0 where it must be."""
+        """Raise :class:`InputError` if a value of the data without gaps is impossible."""
         if np.isinf(values):
             raise InputError(f"data: {name} is {values}; it must be finite")
         if self.positive and values <= 0.0:
             raise InputError(f"data: {name} is {values} {self.unit}; it must be above 0")
 
-    @classmethod
-    def _of_word(cls, scene: Scene, word: str) -> Self:
-        named = cls.parse(scene, word, 0)
-        if named is None:
-            raise InputError(f"'{word}' is no {cls.kind}; write {cls.usage}")
-        return named[1]
+    def restricted(self, entries: np.ndarray | None) -> Self:
+        """Return the observation of ``entries`` alone, or of all for None."""
+        part = copy(self)  # unlike `replace`, `copy` keeps what the observation has computed
+        part._derive(entries=entries)
+        return part
+
+    def __call__(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
+        """Return the data without noise (..., *shape), from one load state; see ``evaluate``."""
+        return self.evaluate(displacement, theta)
+
+    @property
+    def default_noise(self) -> GaussianNoise:
+        """The noise of an observation that names none; :class:`InputError` if it must."""
+        if self.usual_sd is None:
+            name = self.names[0]
+            raise InputError(f"{name} has no usual noise; give --noise {name}=SD, in {self.unit}")
+        return GaussianNoise(sd=self.usual_sd)
+
+    def _derive(self, **attributes: Any) -> None:
+        """Set attributes that follow from the fields; for ``__post_init__``."""
+        for name, value in attributes.items():
+            object.__setattr__(self, name, value)
+
+
+Scalar = Observation
+"""The base class of a single number."""

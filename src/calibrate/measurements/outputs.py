@@ -11,9 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibrate.measurements.collection import Observations, observations
-from calibrate.measurements.observation import Observation
-from calibrate.measurements.registry import observations_from_json, parse_observation
+from calibrate.measurements import (
+    Observation,
+    Observations,
+    observations,
+    observations_from_json,
+    parse_observation,
+)
 from emulator.accuracy.mesh_error import MeshError, MeshErrorEstimate
 from emulator.scenes.scene import ENDOCARDIUM
 from emulator.surrogates.protocol import (
@@ -54,14 +58,13 @@ class Outputs:
         field: bool = False,
         what: str = "prediction",
     ) -> None:
-        nodes = forward.nodes if field else observations(parts).nodes if parts else forward.nodes
+        observe = observations(parts) if parts else None
+        nodes = forward.nodes if field or observe is None else observe.nodes
         self.nodes, self._map = nodes, forward.at(nodes)
+        self._observe, self._field, self._what = observe, field, what
         position = {int(node): k for k, node in enumerate(nodes)}
-        self._rows = {
-            name: np.array([position[int(node)] for node in part.nodes], dtype=int)
-            for name, part in parts.items()
-        }
-        self._parts, self._field, self._what = parts, field, what
+        seen = () if observe is None else observe.nodes.tolist()
+        self._rows = np.array([position[node] for node in seen], dtype=int)
         sizes = {name: int(np.prod(part.shape)) for name, part in parts.items()}
         sizes |= {FIELD: len(nodes)} if field else {}
         ends = np.cumsum([0, *sizes.values()])
@@ -71,9 +74,10 @@ class Outputs:
 
     def of(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the numbers (m,) for the displacement ``u`` (k, 3) mm at ``theta`` (p,)."""
-        numbers = [
-            jnp.ravel(part(u[self._rows[name]], theta)) for name, part in self._parts.items()
-        ]
+        numbers: list[jax.Array] = []
+        if self._observe is not None:
+            seen = self._observe(u[None, self._rows], theta[None])
+            numbers += [jnp.ravel(each) for each in seen.values()]
         if self._field:
             square = jnp.sum(u**2, axis=-1)
             # The derivative of a length is not defined where the displacement is 0.
@@ -84,37 +88,20 @@ class Outputs:
     def values(self, thetas: jax.Array) -> np.ndarray:
         """Return the numbers (n, m) at ``thetas`` (n, p).
 
-        Raises
-        ------
-        InputError
-            The map has no answer at one of them.
+        :class:`InputError` where the map has no answer at one of them.
         """
         predicted = self._predict(thetas)
         require_answers(self._map, predicted, self._what)
         return np.asarray(self._values(predicted.displacement, thetas))
 
     def slopes(self, thetas: jax.Array) -> np.ndarray:
-        """Return derivatives (n, m, p) at ``thetas`` (n, p).
-
-        Raises
-        ------
-        InputError
-            The map has no answer at one of them.
-        """
+        """Return derivatives (n, m, p) at ``thetas`` (n, p); errors as of :meth:`values`."""
         if not isinstance(self._map, SolvingMap):
             require_answers(self._map, self._predict(thetas), self._what)
             return np.asarray(self._derivatives(thetas))
         predicted, sensitivities = self._map.slopes_all(thetas)
         require_answers(self._map, predicted, self._what)
         return np.asarray(self._derivatives_along(predicted.displacement, sensitivities, thetas))
-
-    def _along(self, u: jax.Array, sensitivity: jax.Array, theta: jax.Array) -> jax.Array:
-        """Return derivatives (m, p) at ``theta`` (p,), by ``u`` (k, 3) and du/dtheta (p, k, 3)."""
-
-        def along(du: jax.Array, direction: jax.Array) -> jax.Array:
-            return jax.jvp(self.of, (u, theta), (du, direction))[1]
-
-        return jax.vmap(along, out_axes=-1)(sensitivity, jnp.eye(len(theta)))
 
     @cached_property
     def _predict(self) -> Callable[[jax.Array], Prediction]:
@@ -131,16 +118,19 @@ class Outputs:
 
     @cached_property
     def _derivatives_along(self) -> Callable[..., jax.Array]:
-        return jax.jit(jax.vmap(self._along))
+        """Return derivatives (n, m, p), by ``u`` (n, k, 3), du/dtheta (n, p, k, 3) and theta."""
+
+        def one(u: jax.Array, sensitivity: jax.Array, theta: jax.Array) -> jax.Array:
+            along = lambda *tangents: jax.jvp(self.of, (u, theta), tangents)[1]  # noqa: E731
+            return jax.vmap(along, out_axes=-1)(sensitivity, jnp.eye(len(theta)))
+
+        return jax.jit(jax.vmap(one))
 
 
 def on_finer(error: MeshError, observe: Observations) -> Observations:
     """Return the same observations of the body on the finer mesh.
 
-    Raises
-    ------
-    InputError
-        An observation that is not of a registered kind.
+    :class:`InputError` for an observation that is not of a registered kind.
     """
     return observations_from_json(error.finer.scene, observe.to_json())
 
@@ -152,8 +142,7 @@ def mesh_errors(
 
     Parameters
     ----------
-    error : the simulators on both meshes.
-    estimate : the displacements on both meshes at one theta.
+    error, estimate : the simulators on both meshes, and their displacements at one theta.
     observe : words as of ``calibrate infer``; by default 24 landmarks, and the volume of a cavity
         whose wall is called ``endocardium``.
     seed : the seed for places drawn at random.
@@ -166,14 +155,16 @@ def mesh_errors(
     scene = error.simulator.scene
     if observe is None:
         observe = "landmarks:24" + ("+volume" if ENDOCARDIUM in scene.mesh.facet_sets else "")
-    coarse = parse_observation(scene, observe, seed, ("",))
+    coarse = parse_observation(scene, observe, seed)
     fine = on_finer(error, coarse)
     theta = estimate.theta[None]
     values = coarse(estimate.coarse[coarse.nodes][None], theta)
     finer = fine(estimate.fine[fine.nodes][None], theta)
     rows = {}
     for name, part in coarse.parts.items():
-        size, difference = _size(values[name]), _size(values[name] - finer[name])
+        both = (values[name], values[name] - finer[name])
+        # Of one number as it is, of several the root mean square.
+        size, difference = (float(np.sqrt(np.mean(v**2)) if np.ndim(v) else v) for v in both)
         rows[name] = {
             "unit": part.unit,
             "value": size,
@@ -181,9 +172,3 @@ def mesh_errors(
             "relative": abs(difference) / abs(size) if size else float("nan"),
         }
     return rows
-
-
-def _size(values: jax.Array) -> float:
-    """Return a number as it is, or the root mean square of several."""
-    array = np.asarray(values, float)
-    return float(np.sqrt(np.mean(array**2))) if array.ndim else float(array)

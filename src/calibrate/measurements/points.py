@@ -6,9 +6,10 @@ was measured there.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, ClassVar, Self
 
+import jax
 import numpy as np
 
 from calibrate.measurements.observation import (
@@ -25,6 +26,7 @@ from emulator.scenes.scene import Scene
 
 XYZ = ("x", "y", "z")
 DISPLACEMENT = "displacement"
+_ENTRIES = "present"  # key in JSON of the entries that are not missing
 
 
 class PointObservation(Observation):
@@ -33,25 +35,23 @@ class PointObservation(Observation):
     A kind declares, in addition to what an :class:`Observation` does,
 
     name : its name in data files; ``{}`` stands for a facet set.
-    arguments : the names of the arguments of ``of`` after the scene, which are attributes of the
-        observation and keys of its JSON, too. The last are the places.
+    arguments : as of an :class:`Observation`, and keys of the JSON, too. The last are the places.
     place_field : the field of the places in a file. The names of fields may have ``{}``, too.
     value_fields : the fields of what was measured.
     components : names of the components, or none.
     points : positions of the places in the reference body, mm, (d, 3).
+    spread : the function of the scene, all arguments but the places, a number and a seed that
+        draws so many places at random, for words ``kind:selection:number``.
+    constants : attributes (d, 3) that go with the data in the DataTree, by the name there.
     """
 
     name: ClassVar[str]
-    arguments: ClassVar[tuple[str, ...]]
     place_field: ClassVar[Field]
     value_fields: ClassVar[tuple[Field, ...]]
+    spread: ClassVar[Callable[..., np.ndarray]]
+    constants: ClassVar[Mapping[str, str]] = {"position": "points"}
     components: tuple[str, ...]
     points: np.ndarray
-
-    @classmethod
-    def spread(cls, scene: Scene, selection: str, count: int, seed: int) -> np.ndarray:
-        """Return ``count`` places drawn at random, for words ``kind:selection:count``."""
-        raise NotImplementedError
 
     @classmethod
     def fields(cls, *selection: Any) -> tuple[Field, ...]:
@@ -81,44 +81,71 @@ class PointObservation(Observation):
         return (self.name.format(*self.selection),)
 
     @property
-    def full_shape(self) -> tuple[int, ...]:
-        """(d, c), or (d,) without components."""
+    def _full_shape(self) -> tuple[int, ...]:
         count = len(getattr(self, self.arguments[-1]))
         return (count, len(self.components)) if self.components else (count,)
 
     @property
-    def full_sites(self) -> Sites:
+    def shape(self) -> tuple[int, ...]:
+        """(d, c), or (d,) without components; (n,) where entries are missing."""
+        return self._full_shape if self.entries is None else self.entries.shape
+
+    @property
+    def missing(self) -> int:
+        """Number of entries left out."""
+        return 0 if self.entries is None else int(np.prod(self._full_shape)) - len(self.entries)
+
+    def __call__(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
+        """Return the data without noise (..., *shape), from one load state; see ``evaluate``."""
+        values = self.evaluate(displacement, theta)
+        if self.entries is None:
+            return values
+        batch = values.shape[: values.ndim - len(self._full_shape)]
+        return values.reshape(*batch, -1)[..., self.entries]
+
+    def filled(self, values: np.ndarray) -> np.ndarray:
+        """Return ``values`` (*shape) as data without gaps, NaN where missing."""
+        if self.entries is None:
+            return np.asarray(values)
+        filled = np.full(self._full_shape, np.nan)
+        filled.flat[self.entries] = values
+        return filled
+
+    @property
+    def sites(self) -> Sites:
         """The points, for each component."""
-        return Sites.of(self.points, max(len(self.components), 1))
+        kept = slice(None) if self.entries is None else self.entries
+        return Sites(*(of[kept] for of in Sites.of(self.points, max(len(self.components), 1))))
 
     @classmethod
-    def parse(cls, scene: Scene, word: str, seed: int) -> tuple[str, Self] | None:
+    def parse(cls, scene: Scene, word: str, seed: int) -> tuple[str, Self]:
         """Read ``kind:N`` or ``kind:selection:N``: N places drawn at random."""
         kind, _, rest = word.partition(":")
-        if kind != cls.kind:
-            return None
-        selects = len(cls.arguments) > 1
-        before, _, number = rest.rpartition(":") if selects else ("", "", rest)
-        if not rest or (selects and not before):
+        *selection, number = rest.rsplit(":", 1) if len(cls.arguments) > 1 else [rest]
+        if not rest or len(selection) + 1 < len(cls.arguments) or not all(selection):
             raise cls.misuse(word)
         if not (number.isascii() and number.isdigit()) or int(number) < 1:
             raise InputError(f"observe '{word}': '{number}' is not a number of {kind}")
-        places = cls.spread(scene, before, int(number), seed)
-        part = cls.of(scene, *((before,) if selects else ()), places)
+        places = cls.spread(scene, *selection, int(number), seed)
+        part = cls.of(scene, *selection, places)
         return part.names[0], part
 
-    def described(self) -> dict[str, Any]:
-        """Return the arguments of ``of``."""
+    def to_json(self) -> dict[str, Any]:
+        """Return the arguments of ``of``, and which entries are not missing."""
         arguments = {argument: getattr(self, argument) for argument in self.arguments}
-        return {
+        gaps = {} if self.entries is None else {_ENTRIES: self.entries.tolist()}
+        plain = {
             a: v if isinstance(v, str) else np.asarray(v).tolist() for a, v in arguments.items()
         }
+        return {"kind": self.kind, **plain, **gaps}
 
     @classmethod
     def from_json(cls, scene: Scene, description: Mapping[str, Any]) -> Self:
-        """Return the observation with these arguments."""
+        """Return the observation with these arguments and entries."""
         *selection, places = (description[argument] for argument in cls.arguments)
-        return cls.of(scene, *selection, np.asarray(places))
+        whole = cls.of(scene, *selection, np.asarray(places))
+        entries = description.get(_ENTRIES)
+        return whole if entries is None else whole.restricted(np.asarray(entries))
 
     @classmethod
     def tables(cls, words: Collection[str]) -> dict[str, Table]:
@@ -130,48 +157,59 @@ class PointObservation(Observation):
     def read(
         cls, scene: Scene, name: str, table: Table, arrays: Mapping[str, np.ndarray]
     ) -> tuple[Self, np.ndarray]:
-        """Return the observation and its data, from places and values."""
+        """Return the observation and its data, from places and values.
+
+        Places must be finite, and values finite or, where missing, NaN; :class:`InputError` says
+        which are not.
+        """
         place, *fields = table.fields
         places = arrays[place.variable]
         values = np.column_stack([arrays[field.variable] for field in fields])
-        check_table(places, values, cls.quantity, sum(len(field.columns) for field in fields))
+        what, components = cls.quantity, sum(len(field.columns) for field in fields)
+        if values.ndim != 2 or not len(values) or values.shape[1] != components:
+            raise InputError(f"{what}s have shape {values.shape}; expected (d, {components})")
+        if len(places) != len(values):
+            raise InputError(f"{len(places)} points have {len(values)} {what}s")
+        unknown = ~np.isfinite(places.reshape(len(places), -1))
+        for word, bad in (("position", unknown), (what, np.isinf(values))):
+            if bad.any():
+                row = int(np.argmax(bad.any(axis=1)))
+                raise InputError(f"row {row + 1} has a {word} that is not finite; repair it")
         part = cls.located(scene, table.arguments, places, values)
         return part, values if part.components else values[:, 0]
 
     def block(self, name: str, values: np.ndarray) -> Block:
         """Return the places, and the values of each field."""
         place, *fields = self.fields(*self.selection)
-        rows = values.reshape(len(values), -1)
         ends = np.cumsum([len(field.columns) for field in fields])
-        columns = np.split(rows, ends[:-1], axis=1)
+        columns = np.split(values.reshape(len(values), -1), ends[:-1], axis=1)
         arrays = [each[:, 0] if each.shape[1] == 1 else each for each in columns]
         places = getattr(self, self.arguments[-1])
         return [(place, places), *zip(fields, arrays, strict=True)]
-
-    def constants(self) -> dict[str, np.ndarray]:
-        """Return vectors (d, 3) at the places that go with the data in the DataTree, by name."""
-        return {"position": self.points}
 
     def rows(self) -> tuple[str, np.ndarray]:
         """Return the name of the data's first dimension, and its coordinate (d,)."""
         return "point", np.arange(len(self.points))
 
-    def full_labels(self, name: str) -> Labels:
-        """Return places and components; the reference positions are a constant."""
+    def labels(self, name: str) -> Labels:
+        """Return places and components; entries with gaps are numbered as in the raveled data."""
         # Only one observation is called `displacement`; it keeps the plain labels.
         suffix = "" if name == DISPLACEMENT else f"_{name}"
         word, numbers = self.rows()
         row, vector = f"{word}{suffix}", self.components == XYZ
         column, axis = ("component", "component") if vector else (f"component{suffix}", "axis")
-        constants = {f"{word}{suffix}": values for word, values in self.constants().items()}
-        dims = {name: [row, column] if self.components else [row]}
+        constants = {f"{n}{suffix}": getattr(self, a) for n, a in self.constants.items()}
+        dims = {constant: [row, axis] for constant in constants}
         coords: dict[str, Any] = {row: numbers}
         if self.components:
             coords[column] = list(self.components)
         if constants:
             coords[axis] = list(XYZ)
-        dims |= {constant: [row, axis] for constant in constants}
-        return Labels(dims, coords, constants)
+        dims[name] = [row, column] if self.components else [row]
+        if self.entries is not None:
+            dims[name] = [f"entry_{name}"]
+            coords[f"entry_{name}"] = self.entries
+        return constants, dims, coords
 
     def check_values(self, name: str, values: np.ndarray) -> None:
         """Refuse an infinite value."""
@@ -196,52 +234,25 @@ class DisplacementPoints(PointObservation):
     value_fields = (Field(DISPLACEMENT, ("ux", "uy", "uz")),)
 
 
-def check_table(places: np.ndarray, values: np.ndarray, what: str, components: int) -> None:
-    """Raise :class:`InputError` on a table that cannot be data.
+def as_points(points: Any, what: str, *, distinct: bool = True) -> np.ndarray:
+    """Return positions ``points`` of observations called ``what`` as an array (d, 3) in mm.
 
-    Parameters
-    ----------
-    places : the places, (d,) or (d, 3); they must be finite.
-    values : the data, (d, components); each value must be finite or, where missing, NaN.
-    what : the word for what was measured, for errors.
-    components : the number of components that are expected.
-    """
-    if values.ndim != 2 or not len(values) or values.shape[1] != components:
-        raise InputError(f"{what}s have shape {values.shape}; expected (d, {components})")
-    if len(places) != len(values):
-        raise InputError(f"{len(places)} points have {len(values)} {what}s")
-    unknown = ~np.isfinite(places.reshape(len(places), -1))
-    for word, bad in (("position", unknown), (what, np.isinf(values))):
-        if bad.any():
-            row = int(np.argmax(bad.any(axis=1)))
-            raise InputError(f"row {row + 1} has a {word} that is not finite; repair it")
-
-
-def as_points(points: Any, wrong: str) -> np.ndarray:
-    """Return ``points`` as an array (d, 3) in mm.
-
-    Raises
-    ------
-    InputError
-        Another shape, which is put into the message ``wrong`` at ``{}``, or numbers that are not
-        finite.
+    :class:`InputError` for another shape, numbers that are not finite, or two points at one place,
+    which would count data twice.
     """
     array = np.atleast_2d(np.asarray(points, dtype=float))
     if array.ndim != 2 or array.shape[1] != 3 or not np.isfinite(array).all():
-        raise InputError(wrong.format(array.shape))
-    return array
-
-
-def check_distinct(points: np.ndarray, what: str) -> None:
-    """Raise :class:`InputError` where two of ``points`` (d, 3) mm are one: data counted twice."""
-    _, first, inverse = np.unique(points, axis=0, return_index=True, return_inverse=True)
-    again = np.flatnonzero(first[inverse.ravel()] != np.arange(len(points)))
-    if again.size:
+        raise InputError(f"{what} have shape {array.shape}; expected (d, 3), finite, in mm")
+    _, first, inverse = np.unique(array, axis=0, return_index=True, return_inverse=True)
+    first = first[inverse.ravel()]
+    again = np.flatnonzero(first != np.arange(len(array)))
+    if distinct and again.size:
         k = int(again[0])
         raise InputError(
-            f"{what} {first[inverse.ravel()[k]]} and {k} are both at {points[k].tolist()} mm; give "
+            f"{what} {first[k]} and {k} are both at {array[k].tolist()} mm; give "
             "each place once, repeated measurements as their mean, with less noise"
         )
+    return array
 
 
 def gather(elements: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

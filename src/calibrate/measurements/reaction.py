@@ -19,8 +19,6 @@ _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 class Reaction(Scalar):
     """Force of a support on the body along a direction, one number in N.
 
-    Parameters
-    ----------
     scene : the scene, with a support there.
     support : the name of the support's node set or facet set.
     direction : ``x``, ``y``, ``z``, or three components joined by commas, made unit length.

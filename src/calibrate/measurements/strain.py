@@ -14,7 +14,17 @@ mean
 .. math:: \bar E_s = \frac{1}{|V_s|} \int_{V_s} E_{ee}\, dV
 
 over the reference volume of each of the 17 segments (:mod:`emulator.geometry.heart_wall`), here by
-the mesh's quadrature. Directions are those of :mod:`calibrate.measurements.local_basis`.
+the mesh's quadrature.
+
+**Directions.** In a ventricle's wall the transmural direction :math:`n`
+(:mod:`emulator.geometry.fibres`) and the axis :math:`k` from apex to base, that of the scene's
+fibre rule or else the normal of the facet set ``base`` or else z, give
+
+.. math:: r = n, \qquad c = k \times n / |k \times n|, \qquad l = n \times c ,
+
+radial (out of the cavity), circumferential and longitudinal (towards the base): the cardiac
+coordinates of tagged images. The fibre :math:`f` is the scene's, and the cross-fibre direction
+:math:`n \times f / |n \times f|` lies in the wall's tangent plane, across the fibre.
 """
 
 from __future__ import annotations
@@ -26,73 +36,46 @@ from typing import Any, ClassVar, Self
 import jax
 import jax.numpy as jnp
 import numpy as np
+from emulator.scenes.cavities import ENDOCARDIUM
 
 from calibrate.measurements.displacements import spread_landmarks
-from calibrate.measurements.local_basis import COMPONENTS, local_directions
-from calibrate.measurements.location import locate_gradients
+from calibrate.measurements.location import gradients_at, locate
 from calibrate.measurements.observation import Block, Field
-from calibrate.measurements.points import (
-    XYZ,
-    PointObservation,
-    as_points,
-    check_distinct,
-    gather,
-)
+from calibrate.measurements.points import XYZ, PointObservation, as_points, gather
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import from_quadrature_points
-from emulator.geometry.fibres import unit
+from emulator.geometry.facets import mean_normal
+from emulator.geometry.fibres import circumferential, unit, wall_depth
 from emulator.geometry.heart_wall import SEGMENTS, aha_segments
 from emulator.scenes.scene import Scene
 
+_WALL = (ENDOCARDIUM, "epicardium")
+_BASE = "base"
 _LEAST = -0.5  # strain at a stretch of 0
 
-
-@dataclass(frozen=True, eq=False)
-class Samples:
-    """Strain components at material points, as a function of nodal displacements.
-
-    nodes : the nodes of the points' elements, each once, (k,).
-    members : positions in ``nodes`` of each point's element, (s, a).
-    slopes : derivatives of its shape functions along each direction, 1/mm, (s, c, a).
-    directions : unit vectors, (s, c, 3).
-    """
-
-    nodes: np.ndarray
-    members: np.ndarray
-    slopes: np.ndarray
-    directions: np.ndarray
-
-    @classmethod
-    def of(cls, elements: np.ndarray, gradients: np.ndarray, directions: np.ndarray) -> Self:
-        """Return samples in elements with nodes ``elements`` (s, a).
-
-        Parameters
-        ----------
-        gradients : gradients of the shape functions at the points, 1/mm, (s, a, 3).
-        directions : unit vectors along which strain is observed, (s, c, 3).
-        """
-        nodes, members = gather(elements)
-        slopes = np.einsum("sai,sci->sca", gradients, directions)
-        return cls(nodes, members, slopes, directions)
-
-    def __call__(self, displacement: jax.Array) -> jax.Array:
-        """Return strains (..., s, c) from the displacement (..., k, 3) mm of ``nodes``."""
-        # Points come last, so that the loops over them are vectorised.
-        u = jnp.moveaxis(displacement, -1, -2)[..., self.members.T]  # (..., 3, a, s)
-        slopes = np.moveaxis(self.slopes, 0, -1)[:, None]  # (c, 1, a, s)
-        directions = np.moveaxis(self.directions, 0, -1)  # (c, 3, s)
-        along = jnp.sum(slopes * u[..., None, :, :, :], axis=-2)  # (..., c, 3, s)
-        return jnp.moveaxis(jnp.sum((directions + 0.5 * along) * along, axis=-2), -1, -2)
+COMPONENTS = {
+    "fibre": "E_fibre",
+    "cross_fibre": "E_cross",
+    "circumferential": "E_circ",
+    "longitudinal": "E_long",
+    "radial": "E_rad",
+}
+"""Directions, with the name in files of the strain along each."""
 
 
 class Strains(PointObservation):
-    """Strains (d, c) of ``components`` (c) at d places.
+    """Strains (d, c) of ``components`` (c) at d places, made of those at s samples.
 
-    samples : the points at which strain is evaluated.
+    nodes : the nodes of the samples' elements, each once, (k,).
+    members : positions in ``nodes`` of each sample's element, (s, a).
+    slopes : derivatives of its shape functions along each direction, 1/mm, (s, c, a).
+    directions : unit vectors, (s, c, 3).
     prefix : comes before the components' names in files.
     """
 
-    samples: Samples
+    members: np.ndarray
+    slopes: np.ndarray
+    directions: np.ndarray
     prefix: ClassVar[str] = ""
 
     quantity = "strain"
@@ -102,8 +85,14 @@ class Strains(PointObservation):
     hint = f"; components: {', '.join(COMPONENTS)}"
     value_fields = ()  # one for each component
 
-    def __post_init__(self) -> None:
-        self._derive(nodes=self.samples.nodes)
+    def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
+        """Return strains (..., s, c) of the samples."""
+        # Samples come last, so that the loops over them are vectorised.
+        u = jnp.moveaxis(displacement, -1, -2)[..., self.members.T]  # (..., 3, a, s)
+        slopes = np.moveaxis(self.slopes, 0, -1)[:, None]  # (c, 1, a, s)
+        directions = np.moveaxis(self.directions, 0, -1)  # (c, 3, s)
+        along = jnp.sum(slopes * u[..., None, :, :, :], axis=-2)  # (..., c, 3, s)
+        return jnp.moveaxis(jnp.sum((directions + 0.5 * along) * along, axis=-2), -1, -2)
 
     @classmethod
     def fields(cls, *selection: Any) -> tuple[Field, ...]:
@@ -142,22 +131,17 @@ class Strain(Strains):
 
     components: tuple[str, ...]
     points: np.ndarray
-    samples: Samples
+    nodes: np.ndarray
+    members: np.ndarray
+    slopes: np.ndarray
+    directions: np.ndarray
 
     kind = "strain"
     usage = "strain:COMPONENT,...:N"
     name = "strain"
     arguments = ("components", "points")
     place_field = Field("position_strain", XYZ, where=True)
-
-    def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
-        """Return strains (..., d, c)."""
-        return self.samples(displacement)
-
-    @classmethod
-    def spread(cls, scene: Scene, selection: str, count: int, seed: int) -> np.ndarray:
-        """Return points that are uniform over the volume."""
-        return spread_landmarks(scene, count, seed)
+    spread = staticmethod(lambda scene, _, count, seed: spread_landmarks(scene, count, seed))
 
     @classmethod
     def of(cls, scene: Scene, components: str | Sequence[str], points: Any) -> Self:
@@ -165,9 +149,7 @@ class Strain(Strains):
 
         Parameters
         ----------
-        components : one or more of ``fibre``, ``cross_fibre``, ``circumferential``,
-            ``longitudinal`` and ``radial`` (:mod:`calibrate.measurements.local_basis`); as text
-            joined by commas.
+        components : one or more of :data:`COMPONENTS`; as text joined by commas.
 
         Raises
         ------
@@ -175,29 +157,32 @@ class Strain(Strains):
             A component that the scene has no direction for, or a point outside the body or
             given twice.
         """
-        points = as_points(points, "strain: points of shape {}; expected (d, 3), finite, mm")
-        check_distinct(points, "strains")
-        names = _names(components)
+        points, names = as_points(points, "strain points"), _names(components)
         directions = local_directions(scene, names)
-        elements, inside, gradients = locate_gradients(scene.mesh, points)
+        elements, inside = locate(scene.mesh, points)
+        gradients = gradients_at(scene.mesh, elements, inside)
         weights = from_quadrature_points(scene.mesh.order, inside)
         at_points = unit(np.einsum("dq,dqci->dci", weights, directions[elements]))
-        return cls(names, points, Samples.of(scene.mesh.elements[elements], gradients, at_points))
+        nodes, members = gather(scene.mesh.elements[elements])
+        return cls(names, points, nodes, members, _slopes(gradients, at_points), at_points)
 
 
 @dataclass(frozen=True, eq=False)
 class SegmentStrain(Strains):
     """Mean Green-Lagrange strains (d, c) of ``segments`` (d,) along ``components``, without unit.
 
-    weights : share of each quadrature point in each segment's volume, (d, s).
     points : the segments' centroids, mm, (d, 3).
+    weights : share of each sample, a quadrature point, in each segment's volume, (d, s).
     """
 
     components: tuple[str, ...]
     segments: np.ndarray
-    samples: Samples
-    weights: np.ndarray
     points: np.ndarray
+    weights: np.ndarray
+    nodes: np.ndarray
+    members: np.ndarray
+    slopes: np.ndarray
+    directions: np.ndarray
 
     kind = "segment_strain"
     usage = "segment_strain:COMPONENT,..."
@@ -205,17 +190,17 @@ class SegmentStrain(Strains):
     prefix = "mean_"
     arguments = ("components", "segments")
     place_field = Field("segment", ("segment",), where=True)
+    constants = {}  # a segment's number says where it is
 
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
         """Return mean strains (..., d, c)."""
-        return jnp.einsum("ds,...sc->...dc", self.weights, self.samples(displacement))
+        strains = super().evaluate(displacement, theta)
+        return jnp.einsum("ds,...sc->...dc", self.weights, strains)
 
     @classmethod
-    def parse(cls, scene: Scene, word: str, seed: int) -> tuple[str, Self] | None:
+    def parse(cls, scene: Scene, word: str, seed: int) -> tuple[str, Self]:
         """Read ``segment_strain:circumferential,radial``: strains of all 17 segments."""
-        kind, _, components = word.partition(":")
-        if kind != cls.kind:
-            return None
+        components = word.partition(":")[2]
         if not components:
             raise cls.misuse(word)
         return cls.name, cls.of(scene, components)
@@ -235,30 +220,29 @@ class SegmentStrain(Strains):
             A component that the scene has no direction for, an unknown segment or one given twice,
             or a mesh so coarse that a segment has no element.
         """
-        segments = _checked(np.arange(1, SEGMENTS + 1) if segments is None else segments)
-        names = _names(components)
-        directions = local_directions(scene, names)
-        labels = aha_segments(scene.mesh)
+        numbers = np.asarray(range(1, SEGMENTS + 1) if segments is None else segments, dtype=float)
+        for number in numbers:
+            if number not in range(1, SEGMENTS + 1):
+                raise InputError(f"segment {number:g} is unknown; there are 1 to {SEGMENTS}")
+            if (numbers == number).sum() > 1:
+                raise InputError(f"segment {number:g} is observed twice")
+        segments, names = numbers.astype(int), _names(components)
+        labels, mesh, grid = aha_segments(scene.mesh), scene.mesh, scene.discretisation
         rows = np.flatnonzero(np.isin(labels, segments))
-        grid = scene.discretisation
         element = np.repeat(rows, grid.weights.shape[1])  # of each quadrature point
-        samples = Samples.of(
-            scene.mesh.elements[element],
-            grid.gradients[rows].reshape(len(element), -1, 3),
-            directions[rows].reshape(len(element), -1, 3),
-        )
+        gradients = grid.gradients[rows].reshape(len(element), -1, 3)
+        directions = local_directions(scene, names)[rows].reshape(len(element), -1, 3)
         volume = grid.weights[rows].ravel() * (labels[element] == segments[:, None])
         weights = volume / volume.sum(axis=1, keepdims=True)
-        X = np.einsum("qa,mai->mqi", grid.values, scene.mesh.nodes[scene.mesh.elements[rows]])
-        return cls(names, segments, samples, weights, weights @ X.reshape(-1, 3))
+        X = np.einsum("qa,mai->mqi", grid.values, mesh.nodes[mesh.elements[rows]])
+        points = weights @ X.reshape(-1, 3)
+        nodes, members = gather(mesh.elements[element])
+        slopes = _slopes(gradients, directions)
+        return cls(names, segments, points, weights, nodes, members, slopes, directions)
 
     def rows(self) -> tuple[str, np.ndarray]:
         """Return the numbers of the segments."""
         return "segment", self.segments
-
-    def constants(self) -> dict[str, np.ndarray]:
-        """Return no constants: a segment's number says where it is."""
-        return {}
 
 
 strains = Strain.of
@@ -269,12 +253,54 @@ def _names(components: str | Sequence[str]) -> tuple[str, ...]:
     return tuple(components.split(",") if isinstance(components, str) else components)
 
 
-def _checked(segments: Any) -> np.ndarray:
-    """Return the numbers of segments; :class:`InputError` unless they are whole and unique."""
-    numbers = np.asarray(segments, dtype=float)
-    for number in numbers:
-        if number not in range(1, SEGMENTS + 1):
-            raise InputError(f"segment {number:g} is unknown; there are 1 to {SEGMENTS}")
-        if (numbers == number).sum() > 1:
-            raise InputError(f"segment {number:g} is observed twice")
-    return numbers.astype(int)
+def _slopes(gradients: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    return np.einsum("sai,sci->sca", gradients, directions)
+
+
+def local_directions(scene: Scene, components: Sequence[str]) -> np.ndarray:
+    """Return unit vectors (m, q, c, 3) along ``components`` at the quadrature points.
+
+    Raises
+    ------
+    InputError
+        An unknown component or one that is given twice; a fibre direction where the scene has no
+        fibres; another direction where it has no wall.
+    """
+    for name in components:
+        if name not in COMPONENTS:
+            raise InputError(f"strain along '{name}' is unknown; known: {', '.join(COMPONENTS)}")
+        if list(components).count(name) > 1:
+            raise InputError(f"strain along '{name}' is observed twice; once is enough")
+        if "fibre" in name and scene.fibres is None:
+            raise InputError(f"strain along '{name}': scene '{scene.name}' has no fibres")
+        if "fibre" in name and scene.angles:
+            raise InputError(
+                f"strain along '{name}': theta turns the fibres of scene '{scene.name}'; observe "
+                "strains along circumferential, longitudinal or radial"
+            )
+    if not components:
+        raise InputError(f"strain: name one component or more of {', '.join(COMPONENTS)}")
+    if tuple(components) == ("fibre",):  # fibres are defined without a wall
+        return scene.fibres_at_points[:, :, None]
+    mesh = scene.mesh
+    if not mesh.facet_sets.keys() >= set(_WALL):
+        known = ", ".join(sorted(mesh.facet_sets)) or "none"
+        raise InputError(
+            f"strain in wall directions needs facet sets {' and '.join(_WALL)}; "
+            f"scene '{scene.name}' has {known}"
+        )
+    axis = getattr(scene.fibre_rule, "axis", None)
+    if axis is None and _BASE in mesh.facet_sets:
+        axis = mean_normal(mesh.nodes[mesh.facet_set(_BASE)])
+    k = unit(np.asarray((0.0, 0.0, 1.0) if axis is None else axis, dtype=float))
+    normal = wall_depth(mesh, _WALL[:1], _WALL[1:]).normal
+    n = normal.reshape((*scene.discretisation.weights.shape, 3))
+    c = circumferential(n, k)
+    basis = {"circumferential": c, "longitudinal": np.cross(n, c), "radial": n}
+    if scene.fibres is not None:
+        across = np.cross(n, scene.fibres_at_points)
+        length = np.linalg.norm(across, axis=-1, keepdims=True)
+        if not length.min() > 1e-6:
+            raise InputError("strain: a fibre runs through the wall; it has no cross-fibre")
+        basis |= {"fibre": scene.fibres_at_points, "cross_fibre": across / length}
+    return np.stack([basis[name] for name in components], axis=2)

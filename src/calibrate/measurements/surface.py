@@ -46,7 +46,6 @@ from calibrate.measurements.points import (
     DisplacementPoints,
     PointObservation,
     as_points,
-    check_distinct,
     gather,
 )
 from emulator.core.errors import InputError
@@ -56,6 +55,17 @@ from emulator.scenes.scene import Scene
 
 _SLACK = 1e-3  # largest distance of a point from the surface, in sizes of the body
 _FARTHEST = 1.0  # largest distance of a marker from the surface, in sizes of the body
+
+
+def spread_on_surface(scene: Scene, facet_set: str, count: int, seed: int) -> np.ndarray:
+    """Return ``count`` points (count, 3) mm, uniform over the facets of a set as if flat."""
+    rng = np.random.default_rng(seed)
+    facets = scene.mesh.nodes[scene.mesh.facet_set(facet_set)]
+    side = facets[:, 1:3] - facets[:, :1]
+    area = np.linalg.norm(np.cross(side[:, 0], side[:, 1]), axis=1)
+    chosen = rng.choice(len(facets), count, p=area / area.sum())
+    values, _ = facet_shapes(rng.dirichlet(np.ones(3), count), facets.shape[1])
+    return np.einsum("da,dai->di", values, facets[chosen])
 
 
 class OfFacetSet(PointObservation):
@@ -100,6 +110,8 @@ class SurfacePoints(OfFacetSet):
     place_field = Field("position_{}", XYZ, where=True)
     value_fields = (Field("un:{}", ("un:{}",)),)
     components = ()
+    spread = staticmethod(spread_on_surface)
+    constants = {"position": "points", "normal": "normals"}
 
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
         """Return normal displacements (..., d)."""
@@ -120,31 +132,23 @@ class SurfacePoints(OfFacetSet):
         InputError
             An unknown facet set, or a point further from it than ``slack``.
         """
-        points = as_points(points, "surface points have shape {}; expected (d, 3), finite")
+        points = as_points(points, "surface points", distinct=False)
         facets = scene.mesh.facet_set(facet_set)
-        closest = [closest_point(scene.mesh.nodes[facets], point) for point in points]
-        for k, (foot, point) in enumerate(zip(closest, points, strict=True)):
-            distance = float(np.linalg.norm(foot.position - point))
+        X = scene.mesh.nodes[facets]
+        rows, inside = zip(*(closest_point(X, point) for point in points), strict=True)
+        weights, slopes = facet_shapes(np.array(inside), facets.shape[1])
+        X = X[list(rows)]
+        feet = np.einsum("da,dai->di", weights, X)
+        for k, distance in enumerate(np.linalg.norm(feet - points, axis=1)):
             if not distance <= slack * scene.mesh.size:
                 raise InputError(
-                    f"surface point {k} at {point.tolist()} mm is {distance:.2g} mm away from "
+                    f"surface point {k} at {points[k].tolist()} mm is {distance:.2g} mm away from "
                     f"'{facet_set}' at rest; give points of the reference surface"
                 )
-        nodes, members = gather(facets[[each.facet for each in closest]])
-        positions, normals, weights = (
-            np.stack([getattr(each, name) for each in closest])
-            for name in ("position", "normal", "weights")
-        )
-        return cls(facet_set, nodes, positions, normals, members, weights)
-
-    @classmethod
-    def spread(cls, scene: Scene, selection: str, count: int, seed: int) -> np.ndarray:
-        """Return points that are uniform over the surface."""
-        return spread_on_surface(scene, selection, count, seed)
-
-    def constants(self) -> dict[str, np.ndarray]:
-        """Return reference positions and normals."""
-        return {"position": self.points, "normal": self.normals}
+        normals = np.cross(*np.einsum("dat,dai->tdi", slopes, X))
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        nodes, members = gather(facets[list(rows)])
+        return cls(facet_set, nodes, feet, normals, members, weights)
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,10 +192,8 @@ class RigidMarkers(DisplacementPoints, OfFacetSet):
         return shift[..., None, :] + jnp.einsum("...ij,dj->...di", rotation, arms) - arms
 
     @classmethod
-    def parse(cls, scene: Scene, word: str, seed: int) -> tuple[str, Self] | None:
+    def parse(cls, scene: Scene, word: str, seed: int) -> tuple[str, Self]:
         """Refuse ``markers:...``: pins cannot be drawn at random."""
-        if word.partition(":")[0] != cls.kind:
-            return None
         raise InputError(
             f"observe '{word}': markers stand where they were put; give their positions in a file, "
             "columns x,y,z,mx:FACETSET,my:FACETSET,mz:FACETSET"
@@ -211,8 +213,7 @@ class RigidMarkers(DisplacementPoints, OfFacetSet):
         InputError
             An unknown facet set, or one without extent; a marker given twice, or far from the body.
         """
-        points = as_points(points, "markers have shape {}; expected (d, 3), finite, in mm")
-        check_distinct(points, "markers")
+        points = as_points(points, "markers")
         mesh, facets = scene.mesh, scene.mesh.facet_set(facet_set)
         low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
         distances = np.linalg.norm(points - np.clip(points, low, high), axis=1)
@@ -251,17 +252,6 @@ def surface_distances(
     observe = SurfacePoints.of(scene, facet_set, measured, slack=np.inf)
     offsets = np.atleast_2d(np.asarray(measured, dtype=float)) - observe.points
     return observe, np.sum(offsets * observe.normals, axis=1)
-
-
-def spread_on_surface(scene: Scene, facet_set: str, count: int, seed: int) -> np.ndarray:
-    """Return ``count`` points (count, 3) mm, uniform over the facets of a set as if flat."""
-    rng = np.random.default_rng(seed)
-    facets = scene.mesh.nodes[scene.mesh.facet_set(facet_set)]
-    side = facets[:, 1:3] - facets[:, :1]
-    area = np.linalg.norm(np.cross(side[:, 0], side[:, 1]), axis=1)
-    chosen = rng.choice(len(facets), count, p=area / area.sum())
-    values, _ = facet_shapes(rng.dirichlet(np.ones(3), count), facets.shape[1])
-    return np.einsum("da,dai->di", values, facets[chosen])
 
 
 def _orthonormal(T: jax.Array) -> jax.Array:

@@ -2,11 +2,8 @@
 
 A CSV file has one header line, and columns separated by commas, semicolons or tabs, whichever the
 header has; with the latter two, numbers may have decimal commas. Blanks around words, empty lines
-and lines that begin with ``#`` are ignored. A measured value that is missing is an empty cell,
-``NA`` or ``nan``, and NaN in netCDF; nodes and positions may not be missing. A column ``state``
-names the load state of each row; in netCDF, variables are called ``name@state``. A column or
-variable ``known:NAME`` is a parameter's value in a state; rows of a CSV file with such columns
-and neither ``state`` nor places are a load state each.
+and lines that begin with ``#`` are ignored. Which columns there are says
+:mod:`calibrate.measurements.data`; nodes and positions may not be missing.
 """
 
 from __future__ import annotations
@@ -15,7 +12,7 @@ import csv
 import io
 import re
 from collections.abc import Collection, Mapping, Sequence
-from copy import copy
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -33,99 +30,38 @@ KNOWN = "known:"
 """Before a parameter's name: a column of its value, where that is known."""
 
 _PLACES = {"node", "x", "segment"}  # columns of tables whose rows are places, not load states
-_TEXT = (".csv", ".tsv", ".txt")
-_SPREADSHEETS = (".xlsx", ".xls", ".ods")
+TEXT = (".csv", ".tsv", ".txt")
 _MISSING = ("", "na", "n/a", "nan")
 
 
+@dataclass(frozen=True)
 class CSVTable:
-    """Columns of a CSV file, of all its load states or of one.
+    """Columns of a CSV file in one of its load states.
 
     words : the names of the columns.
-    what : the word for one of them, for errors.
     rows : the text of each cell by column, by the row's number, from 1 after the header.
+    decimal_comma : whether numbers may have decimal commas.
+    what : the word for a column, for errors.
     """
 
-    what = "column"
+    path: Path
+    words: Sequence[str]
+    rows: Mapping[int, Mapping[str, str]]
+    decimal_comma: bool
+    what: str = "column"
 
-    def __init__(self, path: Path) -> None:
-        self.path, lines = path, _lines(path)
-        delimiter = _delimiter(lines[0]) if lines else ","
-        self.decimal_comma = delimiter != ","
-        try:
-            table = csv.reader(io.StringIO("\n".join(lines)), delimiter=delimiter, strict=True)
-            header, *cells = [[cell.strip() for cell in row] for row in table] or [[]]
-        except csv.Error as error:
-            raise InputError(f"data file {path} is not a CSV file: {error}") from error
-        self.words: Sequence[str] = header
-        self._check_header(lines)
-        filled = {k: row for k, row in enumerate(cells, 1) if any(row) or len(row) > 1}
-        self.rows = {k: self._row(k, row) for k, row in filled.items()}
-        if self.words and not self.rows:
-            raise InputError(f"data file {path}: names of columns, and no row below them")
-
-    def _check_header(self, lines: Sequence[str]) -> None:
-        if self.words and all(map(_is_number, self.words)):
-            raise InputError(
-                f"data file {self.path}: its first line, '{lines[0].strip()[:40]}', has no names "
-                "of columns; put them above it, e.g. node,ux,uy,uz"
-            )
-        for word in self.words:
-            if word and self.words.count(word) > 1:
-                raise InputError(f"data file {self.path}: column '{word}' is there twice")
-
-    def _row(self, number: int, cells: list[str]) -> dict[str, str]:
-        if any(cells[len(self.words) :]):
-            hint = "" if self.decimal_comma else "; decimal commas need semicolons between columns"
-            raise InputError(
-                f"data file {self.path}: row {number} has {len(cells)} values for "
-                f"{len(self.words)} columns{hint}"
-            )
-        padded = cells + [""] * (len(self.words) - len(cells))
-        return dict(zip(self.words, padded, strict=False))
-
-    def states(self) -> dict[str, CSVTable]:
-        """Return the table of each load state, by the column ``state`` or a loading curve's rows.
-
-        One empty name where the file names no state.
-        """
-        known = any(word.startswith(KNOWN) for word in self.words)
-        curve = STATE not in self.words and known and not _PLACES & set(self.words)
-        if STATE not in self.words and not curve:
-            return {"": self}
-        tables: dict[str, CSVTable] = {}
-        for number, row in self.rows.items():
-            state = str(number) if curve else row[STATE]
-            if not state or "@" in state or "/" in state:
-                raise InputError(
-                    f"data file {self.path}: row {number}, column '{STATE}' is '{state}'; "
-                    "give every row the name of its load state, without @ and /"
-                )
-            if state not in tables:
-                tables[state] = copy(self)
-                tables[state].rows = {}
-            tables[state].rows[number] = row
-        for table in tables.values():
-            # A column that is empty in a state was not measured there.
-            table.words = [
-                w for w in self.words if w != STATE and any(row[w] for row in table.rows.values())
-            ]
-        return tables
-
+    @property
     def known(self) -> dict[str, float]:
-        """Return the parameters that are known in this load state, from columns ``known:NAME``.
+        """Parameters that are known in this load state, from columns ``known:NAME``.
 
-        Raises
-        ------
-        InputError
-            A value that is no number, or several that differ.
+        :class:`InputError` for a value that is no number, or several that differ.
         """
         values: dict[str, float] = {}
         for word in (w for w in self.words if w.startswith(KNOWN)):
-            name, field = word.removeprefix(KNOWN), Field(word, (word,), where=True)
-            for number, row in self.rows.items():
-                value = self._number(number, row, word, field) if row[word] else None
-                if value is not None and values.setdefault(name, value) != value:
+            name = word.removeprefix(KNOWN)
+            for number in (number for number, row in self.rows.items() if row[word]):
+                value = self._number(number, word)
+                if values.setdefault(name, value) != value:
                     raise InputError(
                         f"data file {self.path}: row {number}, column '{word}' is {value}, and "
                         f"{values[name]} before it in the same load state"
@@ -136,9 +72,7 @@ class CSVTable:
         """Return the words that hold ``field`` in a file of this format."""
         return field.columns
 
-    def arrays(
-        self, fields: Sequence[Field], others: Collection[str] = ()
-    ) -> dict[str, np.ndarray]:
+    def arrays(self, fields: Sequence[Field], others: Collection[str]) -> dict[str, np.ndarray]:
         """Return arrays of numbers by variable, NaN where a measured value is missing.
 
         Parameters
@@ -149,34 +83,90 @@ class CSVTable:
         """
         measured = [word for field in fields if not field.where for word in field.columns]
         places = [word for field in fields if field.where for word in field.columns]
-        rows = {
-            k: row
+        rows = [
+            k
             for k, row in self.rows.items()
             if any(row[w] for w in measured)
             or (any(row[w] for w in places) and not any(row[w] for w in others))
-        }
+        ]
         arrays = {}
         for field in fields:
-            numbers = [
-                [self._number(k, row, w, field) for w in field.columns] for k, row in rows.items()
-            ]
-            array = np.array(numbers, dtype=float).reshape(len(rows), len(field.columns))
-            arrays[field.variable] = array[:, 0] if len(field.columns) == 1 else array
+            words, gaps = field.columns, not field.where
+            numbers = [[self._number(k, word, gaps=gaps) for word in words] for k in rows]
+            array = np.array(numbers, dtype=float).reshape(len(rows), len(words))
+            arrays[field.variable] = array[:, 0] if len(words) == 1 else array
         return arrays
 
-    def _number(self, number: int, row: Mapping[str, str], word: str, field: Field) -> float:
-        text = row[word]
-        if not field.where and text.lower() in _MISSING:
+    def _number(self, number: int, word: str, *, gaps: bool = False) -> float:
+        """Return the number in a row and column; NaN where it is missing and may be."""
+        cell = self.rows[number][word]
+        if gaps and cell.lower() in _MISSING:
             return np.nan
-        if self.decimal_comma and "." not in text:
-            text = text.replace(",", ".")
         try:
-            return float(text)
+            return float(cell.replace(",", ".") if self.decimal_comma and "." not in cell else cell)
         except ValueError as error:
-            fault = f"'{row[word]}', not a number" if row[word] else "empty"
+            fault = f"'{cell}', not a number" if cell else "empty"
             raise InputError(
                 f"data file {self.path}: row {number}, column '{word}' is {fault}"
             ) from error
+
+
+def read_csv(path: Path) -> dict[str, CSVTable]:
+    """Return the table of each load state, by the column ``state`` or a loading curve's rows.
+
+    One empty name where the file names no state.
+    """
+    lines = _lines(path)
+    header = re.sub(r'"[^"]*"', "", lines[0]) if lines else ""  # quoted text does not count
+    delimiter = next((mark for mark in ";\t" if mark in header), ",")
+    try:
+        table = csv.reader(io.StringIO("\n".join(lines)), delimiter=delimiter, strict=True)
+        words, *cells = [[cell.strip() for cell in row] for row in table] or [[]]
+    except csv.Error as error:
+        raise InputError(f"data file {path} is not a CSV file: {error}") from error
+    if words and all(map(_is_number, words)):
+        raise InputError(
+            f"data file {path}: its first line, '{lines[0].strip()[:40]}', has no names "
+            "of columns; put them above it, e.g. node,ux,uy,uz"
+        )
+    for word in words:
+        if word and words.count(word) > 1:
+            raise InputError(f"data file {path}: column '{word}' is there twice")
+    rows: dict[int, dict[str, str]] = {}
+    for number, row in enumerate(cells, 1):
+        if any(row[len(words) :]):
+            hint = "; decimal commas need semicolons between columns" if delimiter == "," else ""
+            raise InputError(
+                f"data file {path}: row {number} has {len(row)} values for {len(words)} "
+                f"columns{hint}"
+            )
+        if any(row) or len(row) > 1:
+            padded = row + [""] * (len(words) - len(row))
+            rows[number] = dict(zip(words, padded, strict=False))
+    if words and not rows:
+        raise InputError(f"data file {path}: names of columns, and no row below them")
+    whole = CSVTable(path, words, rows, decimal_comma=delimiter != ",")
+    curve = any(w.startswith(KNOWN) for w in words) and not {STATE, *_PLACES} & set(words)
+    if STATE not in words and not curve:
+        return {"": whole}
+    states: dict[str, dict[int, dict[str, str]]] = {}
+    for number, cell in rows.items():
+        state = str(number) if curve else cell[STATE]
+        if not state or "@" in state or "/" in state:
+            raise InputError(
+                f"data file {path}: row {number}, column '{STATE}' is '{state}'; "
+                "give every row the name of its load state, without @ and /"
+            )
+        states.setdefault(state, {})[number] = cell
+    # A column that is empty in a state was not measured there.
+    return {
+        state: replace(
+            whole,
+            words=[w for w in words if w != STATE and any(row[w] for row in own.values())],
+            rows=own,
+        )
+        for state, own in states.items()
+    }
 
 
 def _is_number(word: str) -> bool:
@@ -199,45 +189,24 @@ def _lines(path: Path) -> list[str]:
     return [line for line in lines if line.strip() and not line.startswith("#")]
 
 
-def _delimiter(header: str) -> str:
-    """Return the separator of the header's words; quoted text does not count."""
-    bare = re.sub(r'"[^"]*"', "", header)
-    return next((mark for mark in ";\t" if mark in bare), ",")
-
-
+@dataclass(frozen=True)
 class NetCDFTable:
-    """Variables and coordinates of a netCDF file, with the methods of :class:`CSVTable`.
+    """Variables and coordinates of a netCDF file in one load state, as a :class:`CSVTable` has.
 
+    words : the names of the variables, without the state.
     data : the dataset.
     state : the load state whose variables these are, or an empty word.
     """
 
-    what = "variable"
+    path: Path
+    words: Sequence[str]
+    data: xr.Dataset
+    state: str
+    what: str = "variable"
 
-    def __init__(self, path: Path) -> None:
-        try:
-            with xr.open_dataset(path, engine="h5netcdf") as file:
-                self.data = file.load()
-        except (OSError, ValueError, KeyError) as error:
-            raise InputError(
-                f"data file {path} is neither CSV ({', '.join(_TEXT)}) nor readable netCDF"
-            ) from error
-        self.path, self.state = path, ""
-        self.words: Sequence[str] = list(map(str, self.data.variables))
-
-    def states(self) -> dict[str, NetCDFTable]:
-        """Return the variables of each state, by what follows ``@`` in their names."""
-        tables: dict[str, NetCDFTable] = {}
-        # Coordinates without values of their own belong to no state.
-        own = [w for w in self.words if w not in self.data.dims]
-        for state in states_of(own, f"data file {self.path}"):
-            table = tables[state] = copy(self)
-            table.state = state
-            table.words = [base for base, word_state in map(split, own) if word_state == state]
-        return tables
-
+    @property
     def known(self) -> dict[str, float]:
-        """Return the numbers in the variables ``known:NAME``."""
+        """The numbers in the variables ``known:NAME``."""
         words = [word for word in self.words if word.startswith(KNOWN)]
         arrays = self.arrays([Field(word, (word,), where=True) for word in words])
         for word, array in arrays.items():
@@ -264,17 +233,25 @@ class NetCDFTable:
         return arrays
 
 
+def read_netcdf(path: Path) -> dict[str, NetCDFTable]:
+    """Return the variables of each load state, by what follows ``@`` in their names."""
+    try:
+        with xr.open_dataset(path, engine="h5netcdf") as file:
+            data = file.load()
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(
+            f"data file {path} is neither CSV ({', '.join(TEXT)}) nor readable netCDF"
+        ) from error
+    # Coordinates without values of their own belong to no state.
+    own = [str(word) for word in data.variables if word not in data.dims]
+    return {
+        state: NetCDFTable(path, [base for base, s in map(split, own) if s == state], data, state)
+        for state in states_of(own, f"data file {path}")
+    }
+
+
 DataTable = CSVTable | NetCDFTable
-"""Named arrays of a file."""
-
-
-def open_data(path: Path) -> DataTable:
-    """Read the file at ``path``: CSV by its suffix, else netCDF; :class:`InputError` for others."""
-    if not path.is_file():
-        raise InputError(f"data file {path} does not exist")
-    if path.suffix.lower() in _SPREADSHEETS:
-        raise InputError(f"data file {path} is a spreadsheet; save it as CSV")
-    return CSVTable(path) if path.suffix.lower() in _TEXT else NetCDFTable(path)
+"""Named arrays of a file, in one load state."""
 
 
 def write_csv(path: str | Path, states: Mapping[str, Sequence[Block]]) -> None:

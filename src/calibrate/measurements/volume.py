@@ -24,8 +24,6 @@ _PRESSURES = 12  # number of pressures of a curve
 class CavityVolume(Scalar):
     """The volume of a cavity, one number in mL.
 
-    Parameters
-    ----------
     scene : the scene, with the cavity in its mesh.
     facet_set : the cavity's wall; needed where the scene has several cavities.
     cavity : the volume as a function of the wall's displacement, derived.

@@ -11,24 +11,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 
 from calibrate.measurements import Observations
 from calibrate.measurements.points import DisplacementPoints
-from calibrate.model_error.systematic import (
-    Systematic,
-    check_curve,
-    curve_modes,
-    placement,
-    rigid_motion,
-)
+from calibrate.model_error.systematic import Systematic, curve_modes, placement, rigid_motion
 from calibrate.state_names import split
 from emulator.core import schema
 from emulator.core.errors import InputError, look_up
 
-CURVE_SHARE = "curve_share"
 Vector = tuple[float, float, float]
 
 
@@ -36,8 +29,6 @@ Vector = tuple[float, float, float]
 class Measured:
     """The observations and data that systematic errors disturb.
 
-    Attributes
-    ----------
     observe : the observations, without missing values.
     data : their data by name.
     theta : the entry of theta for each parameter, by load state: the known value, or the name of an
@@ -52,17 +43,16 @@ class Measured:
         """Return the observations that words joined by ``+`` name, in one load state or in all."""
         return list(self.observe.expand(dict.fromkeys(words.split("+"), True), "of"))
 
-    def whole(self, name: str) -> tuple[Any, np.ndarray]:
-        """Return the observation with all its entries, and its data, NaN where missing."""
-        part, data = self.observe.parts[name], np.asarray(self.data[name])
-        return part.whole, part.filled(data)
+    def shape(self, name: str) -> tuple[int, ...]:
+        """Return the shape of an observation's data, missing values included."""
+        return self.observe.parts[name].restricted(None).shape
 
     def points(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return points at rest and their displacements, 0 where missing, both (d, 3) mm."""
-        part, data = self.whole(name)
+        part = self.observe.parts[name]
         if not isinstance(part, DisplacementPoints):
             raise InputError(f"of: '{name}' is no displacement of points ({part.quantity})")
-        return part.points, np.nan_to_num(data)
+        return part.points, np.nan_to_num(part.filled(np.asarray(self.data[name])))
 
     def known(self, parameter: str, name: str) -> float:
         """Return the known value of ``parameter`` in the load state of observation ``name``."""
@@ -80,23 +70,15 @@ class Measured:
         """Return ``error`` in the entries that are not missing."""
 
         def reduced(modes: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-            parts = self.observe.parts
+            entries = {name: self.observe.parts[name].entries for name in modes}
             return {
                 name: each
-                if (entries := parts[name].entries) is None
-                else each.reshape(len(each), -1)[:, entries]
+                if entries[name] is None
+                else each.reshape(len(each), -1)[:, entries[name]]
                 for name, each in modes.items()
             }
 
         return replace(error, modes=reduced(error.modes), shares=reduced(error.shares))
-
-
-class SystematicKind(Protocol):
-    """A kind of systematic error; its fields are the entries of a file."""
-
-    def systematic(self, name: str, measured: Measured) -> Systematic:
-        """Return the error called ``name``; :class:`InputError` where it does not fit the data."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -144,15 +126,15 @@ class Placement:
     def systematic(self, name: str, measured: Measured) -> Systematic:
         """Return one offset for each number."""
         names = measured.named(self.of)
-        shapes = {np.shape(measured.whole(each)[1]) for each in names}
+        shapes = {measured.shape(each) for each in names}
         if len(shapes) > 1:
             raise InputError(f"of: {', '.join(names)} have different numbers of points")
         sd = np.zeros(shapes.pop())
-        rows = range(len(sd) if sd.ndim else 1) if self.rows is None else self.rows
-        for row in rows:
-            if not 0 <= row < len(np.atleast_1d(sd)):
+        points = np.atleast_1d(sd)
+        for row in range(len(points)) if self.rows is None else self.rows:
+            if not 0 <= row < len(points):
                 raise InputError(f"rows: there is no point {row}; they are counted from 0")
-            sd[row if sd.ndim else ()] = self.sd
+            points[row] = self.sd
         every = placement(name, names, sd)
         used = np.flatnonzero(np.ravel(sd))
         modes = {each: modes[used] for each, modes in every.modes.items()}
@@ -204,8 +186,8 @@ class Gain:
 
     def systematic(self, name: str, measured: Measured) -> Systematic:
         """Return one factor."""
-        shapes = {each: np.shape(measured.whole(each)[1]) for each in measured.named(self.of)}
-        shares = {each: np.full((1, *shape), self.share) for each, shape in shapes.items()}
+        names = measured.named(self.of)
+        shares = {each: np.full((1, *measured.shape(each)), self.share) for each in names}
         return Systematic((name,), {}, shares=shares)
 
 
@@ -238,16 +220,21 @@ class Curve:
                 raise InputError(f"share_scale is {self.share_scale}; it must be above 0")
             if self.share or self.sd:
                 raise InputError("share_scale is beside share or sd; give one of them")
-        check_curve(self.length, self.constant)
+        if not self.length > 0.0:
+            raise InputError(
+                f"length is {self.length}; it must be above 0, in the unit of the amount"
+            )
+        if not 0.0 <= self.constant <= 1.0:
+            raise InputError(f"constant is {self.constant}; it is a part, 0 to 1")
 
     def systematic(self, name: str, measured: Measured) -> Systematic:
         """Return as many unknowns as the curve can tell apart."""
         observations = measured.named(self.of)
         for each in observations:
-            if np.shape(measured.whole(each)[1]) != ():
+            if measured.shape(each) != ():
                 raise InputError(f"of: '{each}' is not a single number, as a force is")
         amounts = np.array([measured.known(self.along, each) for each in observations])
-        size = None if self.share_scale is None else (CURVE_SHARE, self.share_scale)
+        size = None if self.share_scale is None else ("curve_share", self.share_scale)
         unit = curve_modes(amounts, self.length, constant=self.constant)
         share = self.share if size is None else 1.0
         # The share of the prediction and the further error have unknowns of their own.
@@ -263,7 +250,9 @@ class Curve:
         )
 
 
-SYSTEMATIC_ERRORS: dict[str, type[Any]] = {
+Kind = RigidMotion | Placement | Pins | Gain | Curve
+
+SYSTEMATIC_ERRORS: dict[str, type[Kind]] = {
     "rigid_motion": RigidMotion,
     "placement": Placement,
     "pins": Pins,
@@ -280,21 +269,18 @@ def rotation_of(points: np.ndarray, displacement: np.ndarray) -> np.ndarray:
     return U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ V))]) @ V
 
 
-def read_systematic(name: str, description: Mapping[str, Any]) -> SystematicKind:
+def read_systematic(name: str, description: Mapping[str, Any]) -> Kind:
     """Return the error that a run describes under ``name``.
 
-    Raises
-    ------
-    InputError
-        An unknown kind, an unknown or missing key, or a negative standard deviation.
+    :class:`InputError` for an unknown kind, an unknown or missing key, or a negative standard
+    deviation.
     """
     where = f"systematic '{name}'"
     if "kind" not in description:
         raise InputError(f"{where}: key 'kind' is missing; give {', '.join(SYSTEMATIC_ERRORS)}")
     kind = look_up(SYSTEMATIC_ERRORS, description["kind"], f"{where}: kind")
     entries = {key: value for key, value in description.items() if key != "kind"}
-    error: SystematicKind = schema.read_as(kind, entries, where)
-    return error
+    return schema.read_as(kind, entries, where)
 
 
 def _check_not_negative(**sizes: float) -> None:

@@ -44,6 +44,7 @@ import numpy as np
 import numpyro.distributions as dist
 from jax.flatten_util import ravel_pytree
 
+from calibrate.noise.protocol import PLAUSIBLE
 from emulator.core.errors import InputError
 from emulator.core.small_matrices import eliminated
 from emulator.surrogates.protocol import fingerprint_of
@@ -51,12 +52,12 @@ from emulator.surrogates.protocol import fingerprint_of
 Means = Mapping[str, jax.Array]
 """Data without noise by the observation's name."""
 
-_PLAUSIBLE = 3.0  # scales of a half-normal prior that contain 99.7 % of its mass
 _VARYING = "varying_"  # prefix of the arrays of modes that vary
 # Recorded in saved errors, because in earlier versions shares were of the data.
 _SHARES = "of the prediction"
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Amplitude:
     r"""Size of the errors as a function of the unknowns, by kernel regression on its logarithm.
@@ -64,8 +65,6 @@ class Amplitude:
     .. math:: \log\alpha(x) = \sum_j w_j \log\alpha_j, \qquad
               w_j \propto \exp\left(-\tfrac12 |x - x_j|^2 / h^2\right)
 
-    Attributes
-    ----------
     x : the standardised unknowns (n, q) of the FEM runs.
     log_sizes : the logarithm of the size of each run's error, (n,).
     width : the kernel's width h, in standardised unknowns.
@@ -85,12 +84,11 @@ class Amplitude:
         return jnp.exp(jax.nn.softmax(log_weights) @ self.log_sizes)
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class VaryingModes:
     """Modes that depend on the prediction, or whose size is inferred.
 
-    Attributes
-    ----------
     modes, shares : A and B, (r, d).
     sized : 1 for each mode whose size is inferred, 0 where it is 1, (r,).
     information : W beside these modes, (d, d), or its diagonal (d,) where it has no other entries.
@@ -102,8 +100,8 @@ class VaryingModes:
     shares: np.ndarray
     sized: np.ndarray
     information: np.ndarray
-    name: str = ""
-    scale: float = 0.0
+    name: str = jax.tree.static(default="")
+    scale: float = jax.tree.static(default=0.0)
 
     def at(self, size: jax.Array | float, means: jax.Array) -> jax.Array:
         """Return V (r, d) where the inferred size is ``size`` and the prediction ``means`` (d,)."""
@@ -116,12 +114,11 @@ class VaryingModes:
         return V * self.information if diagonal else V @ self.information
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class ModelError:
     """All errors of a model's data besides its noise.
 
-    Attributes
-    ----------
     weights : A W of the fixed modes, (r, d).
     strength : the diagonal of G, (r,).
     modes : A, the fixed modes at size 1, (r, d).
@@ -139,8 +136,8 @@ class ModelError:
     amplitude: Amplitude | None = None
     varying: VaryingModes | None = None
     mixing: np.ndarray | None = None
-    names: tuple[str, ...] = ()
-    of_mesh: bool = False
+    names: tuple[str, ...] = jax.tree.static(default=())
+    of_mesh: bool = jax.tree.static(default=False)
 
     @property
     def of_fem(self) -> bool:
@@ -199,7 +196,7 @@ class ModelError:
         if self.varying is None:
             return self.modes
         flat, _ = ravel_pytree(dict(means))
-        V = self.varying.at(_PLAUSIBLE * self.varying.scale, flat)
+        V = self.varying.at(PLAUSIBLE * self.varying.scale, flat)
         return np.vstack([self.modes, np.asarray(V)])
 
     def unknowns(self, residual: Means) -> tuple[np.ndarray, np.ndarray]:
@@ -245,17 +242,14 @@ class ModelError:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all that changes a likelihood, by its name in a file."""
-        arrays: dict[str, Any] = {n: getattr(self, n) for n in ("weights", "strength", "modes")}
+        arrays = {n: getattr(self, n) for n in ("weights", "strength", "modes", "mixing")}
         if self.amplitude is not None:
-            arrays |= {each.name: getattr(self.amplitude, each.name) for each in fields(Amplitude)}
-        if self.mixing is not None:
-            arrays["mixing"] = self.mixing
+            arrays |= vars(self.amplitude)
         if self.varying is not None:
-            names = ("modes", "shares", "sized", "information", "scale")
-            arrays |= {f"{_VARYING}{n}": getattr(self.varying, n) for n in names}
+            arrays |= {f"{_VARYING}{n}": v for n, v in vars(self.varying).items() if n != "name"}
         if self.of_mesh:
             arrays["of_mesh"] = True
-        return {name: np.asarray(value) for name, value in arrays.items()}
+        return {name: np.asarray(value) for name, value in arrays.items() if value is not None}
 
     @property
     def words(self) -> dict[str, Any]:
@@ -281,35 +275,15 @@ class ModelError:
                 "the posterior is older than systematic errors that are shares of predictions; "
                 "infer again"
             )
-        own: dict[str, Any] = dict(arrays)
+        own: dict[str, Any] = {n: v for n, v in arrays.items() if not n.startswith(_VARYING)}
         of_mesh = own.pop("of_mesh", None) is not None
-        varying = {n.removeprefix(_VARYING): own.pop(n) for n in arrays if n.startswith(_VARYING)}
         size = {each.name: own.pop(each.name) for each in fields(Amplitude) if each.name in own}
-        return cls(
-            **own,
-            amplitude=Amplitude(**_scalar(size, "width")) if size else None,
-            varying=VaryingModes(**_scalar(varying, "scale"), name=words["size"] or "")
-            if varying
-            else None,
-            names=tuple(words.get("names", ())),
-            of_mesh=of_mesh,
-        )
-
-
-def _scalar(arrays: Mapping[str, np.ndarray], name: str) -> dict[str, Any]:
-    """Return ``arrays`` with the one called ``name`` as a number."""
-    return {key: float(array) if key == name else array for key, array in arrays.items()}
-
-
-jax.tree_util.register_dataclass(Amplitude, [each.name for each in fields(Amplitude)], [])
-jax.tree_util.register_dataclass(
-    VaryingModes, ["modes", "shares", "sized", "information"], ["name", "scale"]
-)
-jax.tree_util.register_dataclass(
-    ModelError,
-    ["weights", "strength", "modes", "amplitude", "varying", "mixing"],
-    ["names", "of_mesh"],
-)
+        if size:
+            own["amplitude"] = Amplitude(**{**size, "width": float(size["width"])})
+        if varying := {n.removeprefix(_VARYING): v for n, v in arrays.items() if _VARYING in n}:
+            scale = float(varying.pop("scale"))
+            own["varying"] = VaryingModes(**varying, name=words["size"] or "", scale=scale)
+        return cls(**own, names=tuple(words.get("names", ())), of_mesh=of_mesh)
 
 
 def diagonal(modes: np.ndarray, information: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -34,7 +35,6 @@ from calibrate.model_error.marginal import ModelError, VaryingModes, diagonal
 from emulator.core.errors import InputError
 from emulator.core.gaussian_process import matern32
 
-Number = float | jax.Array
 Shapes = Mapping[str, tuple[int, ...]]
 
 _NEGLIGIBLE = 1e-8  # share of the largest variance along a curve that no datum could reveal
@@ -44,8 +44,6 @@ _NEGLIGIBLE = 1e-8  # share of the largest variance along a curve that no datum 
 class Systematic:
     """One error that several numbers share.
 
-    Attributes
-    ----------
     names : names of its s unknowns, each a standard normal.
     modes : the change of each observation's data for one standard deviation of each unknown,
         (s, *shape), by the observation's name.
@@ -91,10 +89,8 @@ def marginalised(
     information : information of the noise about the data's means, (d, d).
     unknowns : names of the model's unknowns, which a size that is inferred may not have.
 
-    Raises
-    ------
-    InputError
-        An error does not fit the observations, or two sizes are to be inferred.
+    :class:`InputError` where an error does not fit the observations, or two sizes are to be
+    inferred.
     """
     for error in errors:
         error.check(shapes)
@@ -107,7 +103,17 @@ def marginalised(
         return fixed
     left = np.asarray(fixed.information_left(jnp.asarray(information), jnp.zeros(0), {}))
     on_diagonal = np.diagonal(left)
-    name, scale = _inferred_size(varying, unknowns)
+    sizes = list(dict.fromkeys(error.size for error in varying if error.size is not None))
+    if len(sizes) > 1:
+        raise InputError(
+            f"systematic errors: sizes {sizes[0]} and {sizes[1]} are to be inferred; only one can "
+            "be, by one name and scale"
+        )
+    name, scale = sizes[0] if sizes else ("", 0.0)
+    if name in unknowns:
+        raise InputError(
+            f"systematic errors: a size is called '{name}', as an unknown of the model"
+        )
     sized = [np.full(len(error.names), float(error.size is not None)) for error in varying]
     return replace(
         fixed,
@@ -120,22 +126,6 @@ def marginalised(
             scale=scale,
         ),
     )
-
-
-def _inferred_size(errors: Sequence[Systematic], unknowns: Sequence[str]) -> tuple[str, float]:
-    """Return name and scale of the one size that is inferred; empty and 0 where none is."""
-    sizes = list(dict.fromkeys(error.size for error in errors if error.size is not None))
-    if len(sizes) > 1:
-        raise InputError(
-            f"systematic errors: sizes {sizes[0]} and {sizes[1]} are to be inferred; only one can "
-            "be, by one name and scale"
-        )
-    name, scale = sizes[0] if sizes else ("", 0.0)
-    if name in unknowns:
-        raise InputError(
-            f"systematic errors: a size is called '{name}', as an unknown of the model"
-        )
-    return name, scale
 
 
 def _rows(errors: Sequence[Systematic], shapes: Shapes, kind: str) -> np.ndarray:
@@ -180,12 +170,12 @@ def rigid_motion(
     if not all((sd >= 0.0).all() and np.isfinite(sd).all() for sd in sds):
         raise InputError(f"{name}: sds {shift} mm and {turn} degrees; they must be 0 or more")
     centre = np.concatenate(list(points.values())).mean(axis=0) if about is None else about
-    axes = np.eye(3)
+    axes = np.eye(3)[:, None]
     modes = {}
     for key, each in points.items():
-        shifts = [np.broadcast_to(sds[0][k] * axes[k], each.shape) for k in range(3)]
-        turns = [np.deg2rad(sds[1][k]) * np.cross(axes[k], each - centre) for k in range(3)]
-        modes[key] = np.stack([*shifts, *turns])
+        shifts = np.broadcast_to(sds[0] * axes, (3, *each.shape))
+        turns = np.deg2rad(sds[1])[:, None, None] * np.cross(axes, each - centre)
+        modes[key] = np.concatenate([shifts, turns])
     names = tuple(f"{name} {motion} {axis}" for motion in ("shift", "turn") for axis in "xyz")
     return Systematic(names, modes)
 
@@ -206,40 +196,18 @@ def placement(name: str, observed: Sequence[str], sd: np.ndarray) -> Systematic:
     return Systematic(names, dict.fromkeys(observed, each))
 
 
-def curve_covariance(
-    amounts: jax.Array,
-    values: jax.Array,
-    length: Number,
-    *,
-    share: Number = 0.0,
-    sd: Number = 0.0,
-    constant: Number = 0.0,
-) -> jax.Array:
-    """Return C (..., n, n) of points at ``amounts`` (..., n) with ``values`` (..., n).
+def curve_correlation(amounts: jax.Array, length: Any, constant: float = 0.0) -> jax.Array:
+    """Return C (..., n, n) of points at ``amounts`` (..., n) where omega is 0 and sigma 1.
 
-    Parameters
-    ----------
-    length : the correlation length, () or (..., 1, 1), in the unit of the amounts.
-    share : omega. sd : sigma, in the unit of ``values``.
-    constant : c, 0 to 1.
+    ``length``, () or (..., 1, 1), is in the unit of the amounts; ``constant`` is c, 0 to 1.
     """
     distance = (amounts[..., :, None] - amounts[..., None, :]) / length
-    shape = constant + (1.0 - constant) * matern32(distance**2)
-    return (share**2 * values[..., :, None] * values[..., None, :] + sd**2) * shape
+    return constant + (1.0 - constant) * matern32(distance**2)
 
 
 def curve_modes(amounts: np.ndarray, length: float, *, constant: float = 0.0) -> np.ndarray:
-    """Return modes V (r, n) of :func:`curve_covariance` with sd 1, :math:`C = V^T V`."""
-    zeros = jnp.zeros(len(amounts))
-    C = curve_covariance(jnp.asarray(amounts), zeros, length, sd=1.0, constant=constant)
-    variances, vectors = np.linalg.eigh(np.asarray(C))
+    """Return modes V (r, n) of :func:`curve_correlation`, :math:`C = V^T V`."""
+    C = np.asarray(curve_correlation(jnp.asarray(amounts), length, constant))
+    variances, vectors = np.linalg.eigh(C)
     used = variances > _NEGLIGIBLE * max(float(variances.max()), 1e-300)
     return np.sqrt(variances[used])[::-1, None] * vectors.T[used][::-1]
-
-
-def check_curve(length: float, constant: float) -> None:
-    """Raise :class:`InputError` on a length not above 0, or a constant part outside 0 to 1."""
-    if not length > 0.0:
-        raise InputError(f"length is {length}; it must be above 0, in the unit of the amount")
-    if not 0.0 <= constant <= 1.0:
-        raise InputError(f"constant is {constant}; it is a part, 0 to 1")

@@ -1,11 +1,21 @@
 """Measurement noise, one kind a file; the kinds are listed in :data:`NOISES`."""
 
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
 from calibrate.noise.correlated import CorrelatedNoise
 from calibrate.noise.discrepancy import DiscrepancyNoise, with_discrepancy
 from calibrate.noise.gaussian import GaussianNoise
 from calibrate.noise.protocol import Noise, Sites, information_about_means
-from calibrate.noise.registry import NOISES, noise_of, parse_noise
 from calibrate.noise.student_t import StudentTNoise
+from emulator.core import schema
+from emulator.core.errors import InputError
+
+NOISES: dict[str, type[Noise]] = {
+    kind.kind: kind for kind in (GaussianNoise, StudentTNoise, CorrelatedNoise, DiscrepancyNoise)
+}
 
 __all__ = [
     "NOISES",
@@ -20,3 +30,42 @@ __all__ = [
     "parse_noise",
     "with_discrepancy",
 ]
+
+
+def noise_of(description: float | Mapping[str, Any]) -> Noise:
+    """Return the noise of a run: Gaussian of a known sd, or a kind with its options.
+
+    :class:`InputError` for a kind or an option that is unknown, missing or cannot be.
+    """
+    if not isinstance(description, Mapping):
+        description = {"kind": GaussianNoise.kind, "sd": description}
+    return schema.restore(NOISES, description, "noise")
+
+
+def parse_noise(text: str) -> float | dict[str, Any]:
+    """Return the description of ``0.2`` or ``student_t:dof=4,scale=0.2``, for :func:`noise_of`.
+
+    :class:`InputError` for neither a number nor a kind with options that it takes.
+    """
+    kind, _, options = text.partition(":")
+    if kind not in NOISES:
+        try:
+            return float(text)
+        except ValueError as error:
+            usage = ", ".join(kind.usage for kind in NOISES.values())
+            raise InputError(f"'{text}' is neither a number nor a noise; give {usage}") from error
+    description: dict[str, Any] = {"kind": kind}
+    for option in options.split(",") if options else ():
+        name, equals, value = option.partition("=")
+        if not equals:
+            raise InputError(f"'{text}': '{option}' is not option=value; give {NOISES[kind].usage}")
+        description[name] = _number(value)
+    noise_of(description)  # refuses options that the kind does not take
+    return description
+
+
+def _number(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text

@@ -30,7 +30,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import ClassVar, Self
 
 import jax
@@ -44,8 +44,6 @@ from calibrate.noise.gaussian import independent_sd
 from calibrate.noise.protocol import Noise, Scale, Sites, check_positive
 from emulator.core.errors import InputError, look_up
 from emulator.core.gaussian_process import CORRELATIONS
-
-SPATIAL_SD = "spatial_sd"
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,21 +67,17 @@ class SpatialModes:
                 "it correlates in space, but what is observed has no place of its own; "
                 "use independent noise"
             )
-        correlation = CORRELATIONS[kernel]
         entries = tuple(np.flatnonzero(sites.component == c) for c in np.unique(sites.component))
-        decompositions: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}  # key: the points' bytes
-        modes = []
-        for k in entries:
-            points = sites.positions[k]
-            key = points.tobytes()
-            if key not in decompositions:
-                values, Q = np.linalg.eigh(
-                    correlation(cdist(points, points, "sqeuclidean") / length**2)
-                )
-                decompositions[key] = np.maximum(values, 0.0), Q  # round-off may be below 0
-            modes.append(decompositions[key])
-        values = np.concatenate([values for values, _ in modes])
-        return cls(entries, tuple(Q for _, Q in modes), values)
+
+        @cache  # components are seen at the same points, unless values are missing
+        def decomposed(points: bytes) -> tuple[np.ndarray, np.ndarray]:
+            X = np.frombuffer(points).reshape(-1, 3)
+            K = CORRELATIONS[kernel](cdist(X, X, "sqeuclidean") / length**2)
+            eigenvalues, Q = np.linalg.eigh(K)
+            return np.maximum(eigenvalues, 0.0), Q  # round-off may be below 0
+
+        each = [decomposed(sites.positions[k].astype(float).tobytes()) for k in entries]
+        return cls(entries, tuple(Q for _, Q in each), np.concatenate([v for v, _ in each]))
 
     def to_data(self, z: jax.Array) -> jax.Array:
         """Return raveled data (..., e) from coordinates (..., e) along the modes."""
@@ -149,8 +143,6 @@ class SpatialNormal(dist.Distribution):
 class SpatialNoise(Noise):
     r"""Noise of covariance :math:`\sigma^2 I + \omega^2 K`; subclasses say what correlates.
 
-    Attributes
-    ----------
     length : the known correlation length over reference positions, mm.
     sd, sd_scale : the standard deviation of the independent part, or the scale of its half-normal
         prior.
@@ -196,10 +188,6 @@ class SpatialNoise(Noise):
         bound.modes  # noqa: B018 - computed once, and refused here without sites
         return bound
 
-    def inferred(self, scale: float) -> Self:
-        """Return the noise with the sd of its independent part unknown."""
-        return replace(self, sd=None, sd_scale=scale)  # type: ignore[type-var]
-
     def distribution(self, mean: jax.Array, values: Mapping[str, jax.Array]) -> dist.Distribution:
         """Return the Gaussian around ``mean``, the part that correlates integrated out."""
         independent, spatial = (scale.value(values) for scale in self.scales)
@@ -211,14 +199,7 @@ class SpatialNoise(Noise):
 class CorrelatedNoise(SpatialNoise):
     """Independent noise and noise that correlates over ``length``, in the observation's unit.
 
-    Parameters
-    ----------
-    length : the known correlation length over reference positions, mm.
-    sd, sd_scale : the standard deviation of the independent part, or the scale of its half-normal
-        prior.
     spatial_sd, spatial_sd_scale : the same for the part that correlates.
-    kernel : the kernel, a name of :data:`emulator.core.gaussian_process.CORRELATIONS`.
-    sites : the sites at which the data was measured; a model sets them.
     """
 
     length: float
@@ -236,7 +217,7 @@ class CorrelatedNoise(SpatialNoise):
     def spatial(self) -> Scale:
         """Standard deviation of the part that correlates."""
         options = ("spatial_sd", "spatial_sd_scale")
-        return Scale(SPATIAL_SD, options, self.spatial_sd, self.spatial_sd_scale)
+        return Scale("spatial_sd", options, self.spatial_sd, self.spatial_sd_scale)
 
     def simulate(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
         """Return noise of data of this shape; :class:`InputError` where an sd is not known."""

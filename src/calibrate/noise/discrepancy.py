@@ -27,20 +27,14 @@ from calibrate.noise.protocol import Noise, Scale, Sites
 from emulator.core import schema
 from emulator.core.errors import InputError
 
-DISCREPANCY_SD = "discrepancy_sd"
-
 
 @dataclass(frozen=True)
 class DiscrepancyNoise(SpatialNoise):
     """Independent Gaussian noise and a discrepancy of the model, in the observation's unit.
 
-    Parameters
-    ----------
     scale : the scale of the half-normal prior of the discrepancy's standard deviation.
     length : the known correlation length of the discrepancy over reference positions, mm.
     sd, sd_scale : the options of the independent noise (:class:`~calibrate.noise.GaussianNoise`).
-    kernel : the kernel, a name of :data:`emulator.core.gaussian_process.CORRELATIONS`.
-    sites : the sites at which the data was measured; a model sets them.
     """
 
     scale: float
@@ -56,7 +50,7 @@ class DiscrepancyNoise(SpatialNoise):
     @property
     def spatial(self) -> Scale:
         """Standard deviation of the discrepancy, which is always inferred."""
-        return Scale(DISCREPANCY_SD, ("", "scale"), None, self.scale)
+        return Scale("discrepancy_sd", ("", "scale"), None, self.scale)
 
     def simulate(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
         """Return independent noise alone: data made by the model itself has no discrepancy."""
@@ -76,10 +70,10 @@ def with_discrepancy(noise: Noise, options: Mapping[str, Any]) -> DiscrepancyNoi
     InputError
         Noise of another kind, or options that are wrong.
     """
-    independent = noise.to_json()
-    if independent["kind"] != GaussianNoise.kind:
+    if noise.kind != GaussianNoise.kind:
         raise InputError(
             f"a discrepancy adds to {GaussianNoise.kind} noise, not to {noise.kind} noise"
         )
     kinds = {DiscrepancyNoise.kind: DiscrepancyNoise}
-    return schema.restore(kinds, {**independent, **options, "kind": DiscrepancyNoise.kind}, "noise")
+    own = {**noise.to_json(), **options, "kind": DiscrepancyNoise.kind}
+    return schema.restore(kinds, own, "noise")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import jax
 import numpy as np
@@ -12,20 +12,16 @@ import numpyro.distributions as dist
 
 from calibrate.noise.protocol import Noise, Scale
 
-NOISE_SD = "noise_sd"
-
 
 def independent_sd(sd: float | None, sd_scale: float | None) -> Scale:
     """Return the sd of independent Gaussian noise, called ``noise_sd`` where it is inferred."""
-    return Scale(NOISE_SD, ("sd", "sd_scale"), sd, sd_scale)
+    return Scale("noise_sd", ("sd", "sd_scale"), sd, sd_scale)
 
 
 @dataclass(frozen=True)
 class GaussianNoise(Noise):
     """Independent Gaussian noise on every number of an observation, in the observation's unit.
 
-    Parameters
-    ----------
     sd : standard deviation, when known: mm for displacements, on each component; mL for a volume.
     sd_scale : otherwise the scale of its half-normal prior; the sd is then inferred.
     """
@@ -40,15 +36,6 @@ class GaussianNoise(Noise):
     def scales(self) -> tuple[Scale, ...]:
         """The standard deviation."""
         return (independent_sd(self.sd, self.sd_scale),)
-
-    @property
-    def upper_sd(self) -> float:
-        """The sd, or the 99.7 % quantile of its half-normal prior."""
-        return self.scales[0].upper
-
-    def inferred(self, scale: float) -> Self:
-        """Return Gaussian noise of unknown sd."""
-        return type(self)(sd_scale=scale)
 
     def distribution(self, mean: jax.Array, values: Mapping[str, jax.Array]) -> dist.Distribution:
         """Return independent normal distributions around ``mean``."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Real
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -17,7 +17,7 @@ from jax.flatten_util import ravel_pytree
 from emulator.core import schema
 from emulator.core.errors import InputError
 
-_PLAUSIBLE = 3.0  # scales of a half-normal prior that contain 99.7 % of its mass
+PLAUSIBLE = 3.0  # scales of a half-normal prior that contain 99.7 % of its mass
 
 
 class Sites(NamedTuple):
@@ -42,17 +42,12 @@ class Sites(NamedTuple):
 class Scale:
     """A standard deviation or another scale: known, or inferred under a half-normal prior.
 
-    Parameters
-    ----------
     name : the name of an inferred scale in the posterior.
     options : the names of the two options that set the scale, for error messages.
     known : the value in the observation's unit; or
     prior_scale : the scale of the half-normal prior.
 
-    Raises
-    ------
-    InputError
-        Both are given, neither, or one that is not above 0.
+    :class:`InputError` where both are given, neither, or one that is not above 0.
     """
 
     name: str
@@ -64,23 +59,18 @@ class Scale:
         if (self.known is None) == (self.prior_scale is None):
             first, second = self.options
             raise InputError(f"give either {first} (known) or {second} (of its prior)")
-        check_positive("standard deviation", self._given)
-
-    @property
-    def _given(self) -> float:
-        value = self.prior_scale if self.known is None else self.known
-        assert value is not None
-        return value
+        given = self.prior_scale if self.known is None else self.known
+        check_positive("standard deviation", given)
 
     @property
     def priors(self) -> dict[str, dist.Distribution]:
         """The half-normal prior by the scale's name; empty for a known scale."""
-        return {} if self.known is not None else {self.name: dist.HalfNormal(self._given)}
+        return {} if self.prior_scale is None else {self.name: dist.HalfNormal(self.prior_scale)}
 
     @property
     def upper(self) -> float:
         """The value, or the 99.7 % quantile of the half-normal prior."""
-        return self._given if self.known is not None else _PLAUSIBLE * self._given
+        return self.known or PLAUSIBLE * (self.prior_scale or 0.0)
 
     def value(self, values: Mapping[str, jax.Array]) -> float | jax.Array:
         """Return its value, from ``values`` by name where it is inferred."""
@@ -96,10 +86,8 @@ class Scale:
 class Noise(ABC):
     """Noise of one observation, in the observation's unit.
 
-    A kind is a frozen dataclass that derives from this class; its fields are its options.
+    A kind is a frozen dataclass that derives from this class; its fields are its options. It has
 
-    Attributes
-    ----------
     kind : its name in the registry and in JSON.
     gaussian : whether it is Gaussian where all its numbers are known.
     usage : its options on the command line, for help and errors.
@@ -123,35 +111,29 @@ class Noise(ABC):
         return {name: prior for scale in self.scales for name, prior in scale.priors.items()}
 
     @property
-    @abstractmethod
     def upper_sd(self) -> float:
         """Largest plausible standard deviation of data combined with weights of norm 1.
 
         It is the sd itself for independent Gaussian noise of known sd.
         """
+        return self.scales[0].upper
 
     def at(self, sites: Sites | None) -> Self:
         """Return the noise of data measured at ``sites``; independent noise is the same everywhere.
 
-        Raises
-        ------
-        InputError
-            The noise correlates in space, and there are no sites.
+        :class:`InputError` where the noise correlates in space, and there are no sites.
         """
-        del sites
         return self
 
-    @abstractmethod
     def inferred(self, scale: float) -> Self:
         """Return the noise with its independent sd unknown, under a half-normal prior of scale."""
+        return replace(self, sd=None, sd_scale=scale)  # type: ignore[type-var]
 
     @abstractmethod
     def distribution(self, mean: jax.Array, values: Mapping[str, jax.Array]) -> dist.Distribution:
         """Return the distribution of data with mean ``mean``, all of whose axes are event axes.
 
-        Parameters
-        ----------
-        values : the inferred scales by name.
+        ``values`` are the inferred scales by name.
         """
 
     @abstractmethod

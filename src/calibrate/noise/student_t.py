@@ -22,7 +22,6 @@ import numpyro.distributions as dist
 
 from calibrate.noise.protocol import Noise, Scale, check_positive
 
-NOISE_SCALE = "noise_scale"
 _FAR = 5.0  # sds beyond which data counts as far off (`calibrate.measurements.magnitude`)
 
 
@@ -30,8 +29,6 @@ _FAR = 5.0  # sds beyond which data counts as far off (`calibrate.measurements.m
 class StudentTNoise(Noise):
     """Independent Student-t noise on every number of an observation, in the observation's unit.
 
-    Parameters
-    ----------
     dof : degrees of freedom, known, above 0; 4 is usual, and 1 is the Cauchy distribution.
     scale : when known. It is not the standard deviation, which is larger.
     prior_scale : otherwise the scale of its half-normal prior; the scale is then inferred.
@@ -52,7 +49,7 @@ class StudentTNoise(Noise):
     @property
     def scales(self) -> tuple[Scale, ...]:
         """The scale s."""
-        return (Scale(NOISE_SCALE, ("scale", "prior_scale"), self.scale, self.prior_scale),)
+        return (Scale("noise_scale", ("scale", "prior_scale"), self.scale, self.prior_scale),)
 
     @property
     def upper_sd(self) -> float:

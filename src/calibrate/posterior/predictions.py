@@ -154,7 +154,7 @@ def _programs(model: Model) -> _Programs:
         draw: dict[str, jax.Array], means: Data | None, data: Data
     ) -> dict[str, jax.Array]:
         if means is not None:
-            around = model.distributions(means, model.noise_values(draw))
+            around = model.distributions(draw, means)
             return {name: _pointwise(d, data[name]) for name, d in around.items()}
         trace = model.trace(draw, data)
         sites = {name: trace[_site(name)] for name in model.observe.parts}
@@ -166,7 +166,7 @@ def _programs(model: Model) -> _Programs:
         if means is not None:
             own, *keys = jax.random.split(rng_key, len(means) + 1)
             own_means = model.fem_means(own, draw, means)
-            around = model.distributions(own_means, model.noise_values(draw))
+            around = model.distributions(draw, own_means)
             return {name: d.sample(k) for (name, d), k in zip(around.items(), keys, strict=True)}
         seeded = handlers.substitute(handlers.seed(model, rng_key), data=draw)
         trace = handlers.trace(seeded).get_trace()

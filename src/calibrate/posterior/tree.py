@@ -112,10 +112,8 @@ def labels_of(
     dims: dict[str, list[str]] = {}
     coords: dict[str, Any] = {}
     for name, part in observe.parts.items():
-        labels = part.labels(name)
-        constants.update(labels.constants)
-        dims.update(labels.dims)
-        coords.update(labels.coords)
+        more = part.labels(name)
+        constants, dims, coords = constants | more[0], dims | more[1], coords | more[2]
     return constants, dims, coords
 
 

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -77,10 +76,8 @@ class Population:
     def prior(self, scene: Scene) -> JointPrior:
         """Return the population as the prior of ``scene``, cut to its range.
 
-        Raises
-        ------
-        InputError
-            A parameter that the scene does not have, or one that lies outside its range.
+        :class:`InputError` for a parameter that the scene does not have, or that lies outside its
+        range.
         """
         for name in self.median:
             if name not in scene.parameter_names:
@@ -147,10 +144,7 @@ POPULATIONS = {"ventricles": VENTRICLES}
 def prior_of(description: str | Mapping[str, Any], scene: Scene) -> JointPrior | None:
     """Return the prior of a run: that of a population by name or numbers; ``None`` for ``box``.
 
-    Raises
-    ------
-    InputError
-        An unknown name, or a population that does not fit the scene.
+    :class:`InputError` for an unknown name, or a population that does not fit the scene.
     """
     if description == BOX:
         return None
@@ -160,14 +154,3 @@ def prior_of(description: str | Mapping[str, Any], scene: Scene) -> JointPrior |
         known = ", ".join((BOX, *POPULATIONS))
         raise InputError(f"prior '{description}' is unknown; known: {known}, or a file")
     return POPULATIONS[description].prior(scene)
-
-
-def read_population(path: str | Path) -> Population:
-    """Return the population in a JSON file.
-
-    Raises
-    ------
-    InputError
-        No such file, or a mistake in it, by file, line and key.
-    """
-    return schema.read_json_as(Population, path)

@@ -17,7 +17,7 @@ parameters are sampled one after the other, each given those before,
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -57,14 +57,9 @@ def truncated_normal(
     InputError
         ``sd`` is not above 0, or ``low`` not below ``high``.
     """
-    _check_positive("sd", sd)
-    _check_order(low, high)
-    return dist.TruncatedNormal(
-        mean,
-        sd,
-        low=low if math.isfinite(low) else None,
-        high=high if math.isfinite(high) else None,
-    )
+    _check(low, high, sd=sd)
+    first, last = (end if math.isfinite(end) else None for end in (low, high))
+    return dist.TruncatedNormal(mean, sd, low=first, high=last)
 
 
 def log_normal(
@@ -79,9 +74,7 @@ def log_normal(
     InputError
         ``median`` or ``log_sd`` is not above 0, or ``low`` not below ``high``.
     """
-    _check_positive("median", median)
-    _check_positive("log_sd", log_sd)
-    _check_order(low, high)
+    _check(low, high, median=median, log_sd=log_sd)
     whole = dist.LogNormal(math.log(median), log_sd)
     if low <= 0.0 and high == math.inf:
         return whole
@@ -139,11 +132,6 @@ class Truncated(dist.Distribution):
         super().__init__(batch_shape=(), event_shape=())
 
     @property
-    def support(self) -> constraints.Constraint:
-        """The interval."""
-        return self._support
-
-    @property
     def _ends(self) -> tuple[jax.Array, jax.Array]:
         """Cumulative distribution function of the base at both ends."""
         return self.base_dist.cdf(self.low), self.base_dist.cdf(self.high)
@@ -151,7 +139,7 @@ class Truncated(dist.Distribution):
     def log_prob(self, value: ArrayLike) -> jax.Array:
         """Return the log density: the base's less the log of its mass inside; -inf outside."""
         below, above = self._ends
-        inside = self._support(value)
+        inside = (value >= self.low) & (value <= self.high)
         safe = jnp.where(inside, value, 0.5 * (self.low + self.high))
         return jnp.where(inside, self.base_dist.log_prob(safe) - jnp.log(above - below), -jnp.inf)
 
@@ -222,10 +210,7 @@ class Dependence:
     def ordered(self, names: tuple[str, ...]) -> Dependence:
         """Return the dependence with its parameters in the order they have in ``names``.
 
-        Raises
-        ------
-        InputError
-            One that is not among ``names``.
+        :class:`InputError` for one that is not among ``names``.
         """
         for name in self.names:
             if name not in names:
@@ -253,15 +238,12 @@ class Dependence:
         return {"names": list(self.names), "correlation": self.correlation.tolist()}
 
 
-@dataclass(frozen=True, eq=False)
-class JointPrior(Mapping[str, dist.Distribution]):
+class JointPrior(dict[str, dist.Distribution]):
     """A prior by parameter, as every prior, and how the parameters depend on each other.
 
     ``{**joint, "pressure": ...}`` is an ordinary prior without the dependence; to add a parameter,
     make a new joint prior.
 
-    Parameters
-    ----------
     marginals : distribution of each parameter. Those that depend on each other need ``cdf`` and
         ``icdf``.
     dependence : the correlation of some of them.
@@ -272,20 +254,10 @@ class JointPrior(Mapping[str, dist.Distribution]):
         A parameter that depends on others and has no distribution.
     """
 
-    marginals: Mapping[str, dist.Distribution]
-    dependence: Dependence
-
-    def __post_init__(self) -> None:
-        self.dependence.ordered(tuple(self.marginals))
-
-    def __getitem__(self, name: str) -> dist.Distribution:
-        return self.marginals[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.marginals)
-
-    def __len__(self) -> int:
-        return len(self.marginals)
+    def __init__(self, marginals: Prior, dependence: Dependence) -> None:
+        super().__init__(marginals)
+        dependence.ordered(tuple(marginals))
+        self.dependence = dependence
 
 
 def dependence_of(prior: Mapping[str, dist.Distribution] | None) -> Dependence | None:
@@ -313,11 +285,6 @@ class Conditional(dist.Distribution):
         self.centre, self.width = centre, width
         super().__init__(batch_shape=(), event_shape=())
 
-    @property
-    def support(self) -> constraints.Constraint:
-        """The marginal's support."""
-        return self._support
-
     def log_prob(self, value: ArrayLike) -> jax.Array:
         """Return the log density; the marginal's ``-inf`` outside the support."""
         q = _score(self.marginal, value)
@@ -335,11 +302,9 @@ def _score(marginal: dist.Distribution, value: ArrayLike) -> jax.Array:
     return ndtri(jnp.clip(marginal.cdf(value), _EDGE, 1.0 - _EDGE))
 
 
-def _check_positive(name: str, value: float) -> None:
-    if not 0.0 < value < math.inf:
-        raise InputError(f"prior: {name} is {value}; it must be above 0 and finite")
-
-
-def _check_order(low: float, high: float) -> None:
+def _check(low: float, high: float, **positive: float) -> None:
+    for name, value in positive.items():
+        if not 0.0 < value < math.inf:
+            raise InputError(f"prior: {name} is {value}; it must be above 0 and finite")
     if not low < high:
         raise InputError(f"prior: no value lies between {low:g} and {high:g}")

@@ -16,11 +16,12 @@ from typing import Any
 from calibrate.measurements import DISPLACEMENT, Observations
 from calibrate.model_error.kinds import read_systematic
 from calibrate.noise import Noise, noise_of, with_discrepancy
-from calibrate.priors.population import read_population
+from calibrate.priors import Population
 from calibrate.samplers import Sampler, find_sampler, options_from
 from calibrate.state_names import split
 from calibrate.statistical_model import at_sites
 from emulator.core.errors import InputError
+from emulator.core.schema import read_json_as
 from emulator.surrogates import registry, shipped
 
 SYNTHETIC = "synthetic"
@@ -33,7 +34,7 @@ class Run:
 
     scene : a scene's name or file.
     root : the folder of the published data.
-    data : a file, files by load state (:func:`calibrate.measurements.data.read_data`), or
+    data : a file, files by load state (:func:`calibrate.measurements.data.read_measurements`), or
         ``synthetic``: FEM at ``truth`` plus noise.
     truth : parameters of synthetic data by name, ``parameter@state`` in one of several load states
         (:mod:`calibrate.state_names`).
@@ -225,7 +226,7 @@ def with_absolute_paths(entries: Mapping[str, Any], folder: Path = Path()) -> di
 
     def prior(word: str | dict[str, Any]) -> str | dict[str, Any]:
         if isinstance(word, str) and word.endswith(".json"):
-            return asdict(read_population(folder / word))
+            return asdict(read_json_as(Population, folder / word))
         return word
 
     resolve: dict[str, Callable[[Any], Any]] = {

@@ -1,7 +1,24 @@
-"""Models whose data have errors besides noise: declared, described in a run, or learned from FEM.
+r"""Models whose data have errors besides noise: declared, described in a run, or learned from FEM.
 
 The errors themselves, and how they are integrated out, are in :mod:`calibrate.model_error`. They
 need Gaussian noise of known standard deviation, whose information they are marginalised beside.
+
+**Learned.** The forward map's data :math:`g(x)` differ from FEM's by :math:`e(x) = g_\text{FEM}(x)
+- g(x)`. The error is treated as noise whose covariance depends on the unknowns x, so that a poor
+map widens the posterior,
+
+.. math:: y = g(x) + e(x) + \varepsilon, \qquad
+          e(x) \sim N\left(0,\ \alpha(x)^2\, A^T A\right)
+
+(the approximation error of Kaipio and Somersalo 2007, with a size that varies). It is learned from
+n FEM runs at draws of the prior: :math:`\alpha(x_j) \propto |W^{1/2} e_j|`, with W the information
+of the noise about its mean, is interpolated between the runs by a Gaussian kernel on
+:math:`\log \alpha`, its width chosen by leaving runs out; and :math:`A^T A` is the mean of
+:math:`e_j e_j^T / \hat\alpha_{-j}(x_j)^2`, with each run's size predicted from the others, so that
+sizes that are hard to predict make the error larger.
+
+The error has no mean: it does not correct the map, it says how far to believe it. Where the runs
+were on a finer mesh, the error is the mesh's as well, and FEM on the mesh is allowed the same.
 """
 
 from __future__ import annotations
@@ -17,19 +34,20 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from calibrate.measurements.outputs import on_finer
-from calibrate.model_error import learned
 from calibrate.model_error.kinds import Measured, read_systematic
-from calibrate.model_error.marginal import ModelError
+from calibrate.model_error.marginal import Amplitude, ModelError
 from calibrate.model_error.systematic import Systematic, marginalised
 from calibrate.noise import information_about_means
 from calibrate.statistical_model.fem_likelihood import FEMLikelihood
-from calibrate.statistical_model.model import Data, Model
+from calibrate.statistical_model.model import Model
 from emulator.accuracy.mesh_error import mesh_error
 from emulator.core.errors import InputError, SolverError
 from emulator.core.progress import counting
 from emulator.fem import Simulator
 
 FEWEST = 8  # FEM runs from which an error is learned
+_MODES = 12
+_WIDTHS = np.geomspace(0.05, 2.0, 12)  # kernel widths in standardised unknowns
 
 
 def with_systematic(model: Model, *errors: Systematic) -> Model:
@@ -56,10 +74,7 @@ def with_described_errors(
     data : the data by the observation's name, NaN where missing.
     descriptions : the description of each error as in an experiment file, by the error's name.
 
-    Raises
-    ------
-    InputError
-        As :func:`errors_of_data`.
+    Errors as of :func:`errors_of_data`.
     """
     # The scale of data is checked against the model with its errors, not against this one.
     reduced, present = replace(model, check_scale=False).given(data)
@@ -74,10 +89,7 @@ def errors_of_data(
 
     It may be called for many data sets: all that does not depend on the data is computed once.
 
-    Raises
-    ------
-    InputError
-        An error does not fit, by its name; and as :func:`with_systematic`.
+    :class:`InputError` where an error does not fit, by its name; and as :func:`with_systematic`.
     """
     kinds = {name: read_systematic(name, each) for name, each in descriptions.items()}
     marginalise = _marginaliser(model)
@@ -118,10 +130,7 @@ def _marginaliser(model: Model) -> Callable[[Sequence[Systematic]], ModelError]:
         raise InputError("systematic errors: the model's likelihood has an error already")
     information = _noise_information(model, "systematic errors")
     return partial(
-        marginalised,
-        shapes=model.observe.shapes,
-        information=information,
-        unknowns=model.names,
+        marginalised, shapes=model.observe.shapes, information=information, unknowns=model.names
     )
 
 
@@ -136,8 +145,7 @@ def with_error(
 ) -> Model:
     """Return ``model`` whose likelihood allows for the forward map's own error.
 
-    FEM is solved at ``runs`` draws of the prior, from the map's predictions
-    (:mod:`calibrate.model_error.learned`).
+    FEM is solved at ``runs`` draws of the prior, from the map's predictions.
 
     Parameters
     ----------
@@ -158,14 +166,28 @@ def with_error(
         raise InputError("error of the forward map: the simulator is for another scene")
     information = _noise_information(model, "error of the forward map")
     predict = jax.jit(model.predict)
-    by_fem = _on_finer_mesh(model, simulator) if of_mesh else _on_mesh(model, simulator)
+    fem, start = FEMLikelihood(model, simulator), jax.jit(model.full)
+    finer = mesh_error(simulator) if of_mesh else None
+    observe = model.observe if finer is None else on_finer(finer, model.observe)
+
+    def solve(draw: Mapping[str, Any]) -> list[jax.Array] | None:
+        """Return FEM's displacement in each load state; None where there is none."""
+        if finer is None:
+            return next(fem.equilibria([draw]))[1]
+        try:
+            return [finer(theta, start(theta)).fine for theta in model.states.thetas(draw)]
+        except SolverError:
+            return None
+
     draws = model.prior_draws(jax.random.key(seed), runs)
     unknowns, errors = [], []
     what = "error of map and mesh" if of_mesh else "error of the map"
     for k in counting(range(runs), what, disable=not progress, unit="run"):
         values = {name: draw[k] for name, draw in draws.items()}
         means, valid = predict(values)
-        if bool(valid) and (exact := by_fem(values)) is not None:
+        if bool(valid) and (fields := solve(values)) is not None:
+            seen = jnp.stack([u[observe.nodes] for u in fields])
+            exact = observe(seen, model.states.thetas(values))
             errors.append(ravel_pytree(exact)[0] - ravel_pytree(means)[0])
             unknowns.append([float(values[name]) for name in model.states.unknowns])
     if len(errors) < FEWEST:
@@ -173,36 +195,47 @@ def with_error(
             f"error of the forward map: FEM and the map answered at {len(errors)} of {runs} draws "
             f"of the prior; {FEWEST} are needed"
         )
-    error = learned.fit(np.array(unknowns), np.array(errors), information, of_mesh=of_mesh)
-    return replace(model, error=error)
+    fitted = fit(np.array(unknowns), np.array(errors), information, of_mesh=of_mesh)
+    return replace(model, error=fitted)
 
 
-ByFEM = Callable[[Mapping[str, Any]], Data | None]
-"""Data without noise by FEM at a draw of the prior; ``None`` where FEM has no answer."""
+def fit(
+    unknowns: np.ndarray, errors: np.ndarray, information: np.ndarray, *, of_mesh: bool = False
+) -> ModelError:
+    """Return the error that FEM runs show.
+
+    Parameters
+    ----------
+    unknowns : the unknowns at which FEM was run, (n, q).
+    errors : FEM's data less the map's, all observations raveled, (n, d).
+    information : the information W of the noise about its mean, (d, d).
+    of_mesh : whether FEM was run on a finer mesh.
+    """
+    root = np.linalg.cholesky(information)  # W = root root^T
+    centre, scale = unknowns.mean(axis=0), np.maximum(unknowns.std(axis=0), 1e-12)
+    x, whitened = (unknowns - centre) / scale, errors @ root
+    norms = np.linalg.norm(whitened, axis=1)
+    log_sizes = np.log(np.maximum(norms, 1e-12 * max(float(norms.max()), 1e-300)))
+    width = min(
+        _WIDTHS, key=lambda w: float(np.mean((_left_out(x, log_sizes, w) - log_sizes) ** 2))
+    )
+    shapes = whitened / np.exp(_left_out(x, log_sizes, width))[:, None]
+    _, singular, right = np.linalg.svd(shapes / np.sqrt(len(shapes)), full_matrices=False)
+    used = np.arange(len(singular)) < _MODES
+    used &= singular > 1e-6 * max(float(singular[0]), 1e-300)
+    rows = singular[used, None] * right[used]  # A root, orthogonal
+    return ModelError(
+        weights=rows @ root.T,
+        strength=singular[used] ** 2,
+        modes=np.linalg.solve(root.T, rows.T).T,
+        amplitude=Amplitude(x, log_sizes, float(width), centre, scale),
+        of_mesh=of_mesh,
+    )
 
 
-def _on_mesh(model: Model, simulator: Simulator) -> ByFEM:
-    fem, nodes = FEMLikelihood(model, simulator), model.observe.nodes
-
-    def by_fem(draw: Mapping[str, Any]) -> Data | None:
-        ((_, fields),) = fem.equilibria([draw])
-        if fields is None:
-            return None
-        return model.observe(jnp.stack([u[nodes] for u in fields]), model.states.thetas(draw))
-
-    return by_fem
-
-
-def _on_finer_mesh(model: Model, simulator: Simulator) -> ByFEM:
-    error = mesh_error(simulator)
-    observe, start = on_finer(error, model.observe), jax.jit(model.full)
-
-    def by_fem(draw: Mapping[str, Any]) -> Data | None:
-        thetas = model.states.thetas(draw)
-        try:
-            estimates = [error(theta, start(theta)) for theta in thetas]
-        except SolverError:
-            return None
-        return observe(jnp.stack([each.fine[observe.nodes] for each in estimates]), thetas)
-
-    return by_fem
+def _left_out(x: np.ndarray, values: np.ndarray, width: float) -> np.ndarray:
+    """Return leave-one-out predictions of ``values`` (n,) at ``x`` (n, q) by kernel regression."""
+    squared = np.sum((x[:, None] - x[None]) ** 2, axis=-1) / width**2
+    np.fill_diagonal(squared, np.inf)
+    weights = np.exp(-0.5 * (squared - squared.min(axis=1, keepdims=True)))
+    return weights @ values / weights.sum(axis=1)

@@ -7,8 +7,6 @@ stage. It is the only place that solves FEM for a draw.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -49,29 +47,23 @@ class Likelihoods(NamedTuple):
     slopes: np.ndarray | None = None
 
 
-@dataclass(frozen=True, eq=False)
 class FEMLikelihood:
     """FEM's log likelihood under ``model``; solves start from the cheap map's prediction.
 
-    Parameters
-    ----------
     model : the statistical model.
     simulator : the FEM simulator of the model's scene.
     execute : the executor of the solves, in this process by default.
 
-    Raises
-    ------
-    InputError
-        The simulator is for another scene.
+    :class:`InputError` where the simulator is for another scene.
     """
 
-    model: Model
-    simulator: Simulator
-    execute: Executor = in_process
-
-    def __post_init__(self) -> None:
-        if self.simulator.scene.fingerprint != self.model.forward.scene.fingerprint:
+    def __init__(self, model: Model, simulator: Simulator, execute: Executor = in_process) -> None:
+        if simulator.scene.fingerprint != model.forward.scene.fingerprint:
             raise InputError("the simulator's scene is not the posterior's")
+        self.model, self.simulator, self.execute = model, simulator, execute
+        self._solver = Solver(simulator, from_rest_again=False)
+        self._start, self._cheap = jax.jit(model.full), jax.jit(model.map_log_likelihood)
+        self._fem, self._derivatives = jax.jit(self._by_fem), jax.jit(self._slopes_of_means)
 
     def __call__(
         self, draw: Mapping[str, Any], data: Data, *, stability: bool = False
@@ -104,18 +96,10 @@ class FEMLikelihood:
                 yield number, Likelihoods(-np.inf, cheap, converged=False, smallest_J=np.nan)
                 continue
             fem, means, smallest_J = self._fem(jnp.stack(fields), thetas, dict(draw), data)
-            yield (
-                number,
-                Likelihoods(
-                    fem=float(fem),
-                    cheap=cheap,
-                    converged=True,
-                    smallest_J=float(smallest_J),
-                    means=means,
-                    stable=self._stable(fields, thetas) if number in stability else None,
-                    slopes=self._slopes(fields, thetas) if slopes else None,
-                ),
-            )
+            stable = self._stable(fields, thetas) if number in stability else None
+            derivatives = self._slopes(fields, thetas) if slopes else None
+            found = (float(fem), cheap, True, float(smallest_J), means, stable, derivatives)
+            yield number, Likelihoods(*found)
 
     def equilibria(
         self, draws: Sequence[Mapping[str, Any]]
@@ -175,35 +159,18 @@ class FEMLikelihood:
             return None
         return np.asarray(self._derivatives(jnp.stack(fields)[:, nodes], jnp.stack(each), thetas))
 
-    @cached_property
-    def _derivatives(self):  # noqa: ANN202
-        def derivatives(u, slopes, thetas):  # noqa: ANN001, ANN202
-            def means(shifted):  # noqa: ANN001, ANN202
-                step = jnp.einsum("sp,sp...->s...", shifted - thetas, slopes)
-                return ravel_pytree(self.model.observe(u + step, shifted))[0]
+    def _slopes_of_means(self, u: jax.Array, slopes: jax.Array, thetas: jax.Array) -> jax.Array:
+        """Return derivatives (m, S, p), from u (S, k, 3) and du/dtheta (S, p, k, 3) there."""
 
-            return jax.jacfwd(means)(thetas)
+        def means(shifted: jax.Array) -> jax.Array:
+            step = jnp.einsum("sp,sp...->s...", shifted - thetas, slopes)
+            return ravel_pytree(self.model.observe(u + step, shifted))[0]
 
-        return jax.jit(derivatives)
+        return jax.jacfwd(means)(thetas)
 
-    @cached_property
-    def _solver(self) -> Solver:
-        return Solver(self.simulator, from_rest_again=False)
-
-    @cached_property
-    def _start(self):  # noqa: ANN202 - a compiled program, private
-        return jax.jit(self.model.full)
-
-    @cached_property
-    def _cheap(self):  # noqa: ANN202
-        return jax.jit(self.model.map_log_likelihood)
-
-    @cached_property
-    def _fem(self):  # noqa: ANN202
-        def fem(displacement, thetas, draw, data):  # noqa: ANN001, ANN202
-            means = self.model.observe(displacement[:, self.model.observe.nodes], thetas)
-            value = self.model.fem_log_likelihood(draw, means, data)
-            ratios = [volume_ratio(self.simulator.scene, u) for u in displacement]
-            return value, means, jnp.min(jnp.stack(ratios))
-
-        return jax.jit(fem)
+    def _by_fem(self, fields: jax.Array, thetas: jax.Array, draw: Data, data: Data) -> Any:
+        """Return the log likelihood, the means and the smallest volume ratio."""
+        means = self.model.observe(fields[:, self.model.observe.nodes], thetas)
+        value = self.model.fem_log_likelihood(draw, means, data)
+        ratios = [volume_ratio(self.simulator.scene, u) for u in fields]
+        return value, means, jnp.min(jnp.stack(ratios))

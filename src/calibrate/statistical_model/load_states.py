@@ -12,7 +12,7 @@ Names say which state is meant, ``pressure@p8`` (:mod:`calibrate.state_names`).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,10 +40,8 @@ class LoadStates:
     @property
     def unknowns(self) -> tuple[str, ...]:
         """Names of the unknowns, in theta's order, and within it in the states' order."""
-        columns = zip(*self.entries, strict=True)
-        return tuple(
-            dict.fromkeys(entry for column in columns for entry in column if isinstance(entry, str))
-        )
+        entries = (entry for column in zip(*self.entries, strict=True) for entry in column)
+        return tuple(dict.fromkeys(entry for entry in entries if isinstance(entry, str)))
 
     def to_json(self) -> dict[str, list[str | float]]:
         """Return each state's entries of theta: a name where inferred, else the known value."""
@@ -75,59 +73,39 @@ def load_states(
         parameter of the loads that is named without a state is meant in every state that is not
         named. A parameter that neither names has the scene's box as its prior.
 
-    Raises
-    ------
-    InputError
-        A name that is no parameter or state, or one both known and with a prior.
+    :class:`InputError` for a name that is no parameter or state, or one both known and with a
+    prior.
     """
-    prior, known = dict(prior or {}), dict(known or {})
-    by_state = _parameters_by_state(scene, states, (*prior, *known))
-    default = box_prior(scene)
-    priors: dict[str, dist.Distribution] = {}
-
-    def entry(parameter: str, state: str) -> str | float:
-        name = in_state(parameter, state) if parameter in by_state else parameter
-        source = name if name in known or name in prior else parameter
-        if source in known and source in prior:
-            raise InputError(f"'{name}' is known and has a prior; give one of them")
-        if source in known:
-            return float(known[source])
-        priors[name] = prior.get(source, default[parameter])
-        return name
-
-    rows = [tuple(entry(parameter, s) for parameter in scene.parameter_names) for s in states]
-    result = LoadStates(states, tuple(rows))
+    prior, box = prior or {}, box_prior(scene)
+    result = LoadStates(states, _entries(scene, states, prior, known or {}))
     if not result.unknowns:
         raise InputError("every parameter is known; leave one to be inferred")
-    return result, {name: priors[name] for name in result.unknowns}
+    priors = {
+        name: prior.get(name, prior.get(base, box[base]))
+        for name, base in ((name, split(name)[0]) for name in result.unknowns)
+    }
+    return result, priors
 
 
 def known_thetas(scene: Scene, states: tuple[str, ...], values: Mapping[str, float]) -> jax.Array:
     """Return theta (S, p) of states in which ``values`` names every parameter.
 
-    Raises
-    ------
-    InputError
-        A name that is no parameter or state, a parameter without a value or outside its range.
+    :class:`InputError` for a name that is no parameter or state, a parameter without a value or
+    outside its range.
     """
-    by_state = _parameters_by_state(scene, states, values)
-    rows = []
-    for state in states:
-        row = {}
-        for parameter in scene.parameter_names:
-            name = in_state(parameter, state) if parameter in by_state else parameter
-            if (value := values.get(name, values.get(parameter))) is not None:
-                row[parameter] = value
-            elif name != parameter:
-                raise InputError(f"scene '{scene.name}': no value for parameter '{name}'")
-        rows.append(scene.theta(**row))
-    return jnp.stack(rows)
+    entries = _entries(scene, states, {}, values)
+    if missing := [entry for row in entries for entry in row if isinstance(entry, str)]:
+        raise InputError(f"scene '{scene.name}': no value for parameter '{missing[0]}'")
+    rows = [dict(zip(scene.parameter_names, map(float, row), strict=True)) for row in entries]
+    return jnp.stack([scene.theta(**row) for row in rows])
 
 
-def _parameters_by_state(scene: Scene, states: tuple[str, ...], names: Iterable[str]) -> set[str]:
-    """Return parameters with a value of their own in each state: the loads', and by ``names``."""
+def _entries(
+    scene: Scene, states: tuple[str, ...], prior: Collection[str], known: Mapping[str, float]
+) -> tuple[tuple[str | float, ...], ...]:
+    """Return the entries of :class:`LoadStates`."""
     by_state = set(scene.load_parameters) if states != ("",) else set()
-    for name in names:
+    for name in (*prior, *known):
         parameter, state = split(name)
         if parameter not in scene.parameter_names:
             raise InputError(
@@ -135,8 +113,16 @@ def _parameters_by_state(scene: Scene, states: tuple[str, ...], names: Iterable[
                 f"it has {', '.join(scene.parameter_names)}"
             )
         if state and state not in states:
-            known = ", ".join(filter(None, states)) or "none; nothing is observed at a state"
-            raise InputError(f"'{name}': load state '{state}' is unknown; known: {known}")
+            listed = ", ".join(filter(None, states)) or "none; nothing is observed at a state"
+            raise InputError(f"'{name}': load state '{state}' is unknown; known: {listed}")
         if state:
             by_state.add(parameter)
-    return by_state
+
+    def entry(parameter: str, state: str) -> str | float:
+        name = in_state(parameter, state) if parameter in by_state else parameter
+        source = name if name in known or name in prior else parameter
+        if source in known and source in prior:
+            raise InputError(f"'{name}' is known and has a prior; give one of them")
+        return float(known[source]) if source in known else name
+
+    return tuple(tuple(entry(p, state) for p in scene.parameter_names) for state in states)

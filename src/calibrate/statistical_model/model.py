@@ -45,16 +45,11 @@ Data = Mapping[str, jax.Array]
 
 _GROUP = "observed_data"  # group of a posterior's DataTree
 
-NoiseValues = Mapping[str, Mapping[str, jax.Array]]
-"""Inferred scales of each observation's noise: observation to the scale's name to its value."""
-
 
 @dataclass(frozen=True, eq=False)
 class Model:
     """A NumPyro model: call it with the data. :func:`model` makes it.
 
-    Parameters
-    ----------
     forward : the forward map, restricted to the observed nodes.
     full : the same map over all nodes.
     observe : the observations by name.
@@ -177,7 +172,7 @@ class Model:
                 means = self.error.draw(numpyro.prng_key(), self._stacked(draw), means)
             else:
                 numpyro.factor("error", self._error_ratio(draw, means, observed))
-        for name, distribution in self.distributions(means, self.noise_values(draw)).items():
+        for name, distribution in self.distributions(draw, means).items():
             obs = None if observed is None else observed[name]
             numpyro.sample(f"observed_{name}", distribution, obs=obs)
 
@@ -198,23 +193,20 @@ class Model:
         prediction = self.evaluate(thetas)
         return self.observe(prediction.displacement, thetas), prediction.valid
 
-    def noise_values(self, draw: Mapping[str, jax.Array]) -> dict[str, dict[str, jax.Array]]:
-        """Return the inferred scales of each observation's noise, from ``draw``."""
-        return {
+    def distributions(self, draw: Mapping[str, Any], means: Data) -> dict[str, dist.Distribution]:
+        """Return the distribution of each observation's data around its mean, by name.
+
+        ``draw`` has the inferred scales of the noises, by their names in the posterior.
+        """
+        scales = {
             name: {scale: jnp.asarray(draw[site]) for scale, site in sites.items()}
             for name, sites in self.noise_sites.items()
         }
+        return {n: self.noise[n].distribution(mean, scales[n]) for n, mean in means.items()}
 
-    def distributions(self, means: Data, values: NoiseValues) -> dict[str, dist.Distribution]:
-        """Return the distribution of each observation's data around its mean, by name.
-
-        ``values`` are the inferred scales of the noises (:meth:`noise_values`).
-        """
-        return {n: self.noise[n].distribution(mean, values[n]) for n, mean in means.items()}
-
-    def log_density(self, means: Data, values: NoiseValues, data: Data) -> jax.Array:
+    def log_density(self, draw: Mapping[str, Any], means: Data, data: Data) -> jax.Array:
         """Return the log density of ``data`` around ``means`` with noise alone, ()."""
-        parts = self.distributions(means, values)
+        parts = self.distributions(draw, means)
         return sum((d.log_prob(data[name]) for name, d in parts.items()), jnp.zeros(()))
 
     def fem_log_likelihood(self, draw: Mapping[str, Any], means: Data, data: Data) -> jax.Array:
@@ -222,7 +214,7 @@ class Model:
 
         Where the likelihood allows for errors of the mesh or of the measurement, FEM has them, too.
         """
-        log_density = self.log_density(means, self.noise_values(draw), data)
+        log_density = self.log_density(draw, means, data)
         if self.error is not None and self.error.of_fem:
             log_density += self._error_ratio(draw, means, data)
         return log_density
@@ -263,10 +255,8 @@ class Model:
     ) -> tuple[Model, dict[str, jax.Array]]:
         """Return the model of the values that are not missing (NaN), and these, checked.
 
-        Raises
-        ------
-        InputError
-            As :meth:`check_data`, or every value of an observation is missing.
+        :class:`InputError` as :meth:`check_data`, or where every value of an observation is
+        missing.
         """
         observe, present = leave_out_missing(self.observe, self._fitting(data))
         if all(part is self.observe.parts[name] for name, part in observe.parts.items()):
@@ -321,10 +311,10 @@ class Model:
             name: np.asarray(values, dtype=float)
             for name, values in self.observe.name(data, "data").items()
         }
-        for name in [n for n, shape in self.observe.shapes.items() if shape == ()]:
-            named[name] = named[name].reshape(()) if named[name].shape == (1,) else named[name]
-        for name, values in named.items():
-            self.observe.parts[name].check(name, values)
+        for name, part in self.observe.parts.items():
+            if part.shape == () and named[name].shape == (1,):
+                named[name] = named[name].reshape(())
+            part.check(name, named[name])
         return named
 
 
@@ -359,8 +349,14 @@ def model(
         (:mod:`calibrate.statistical_model.prior_range`).
     """
     several = observations(observe)
-    names, noises = _noises(several, noise)
-    noises = at_sites(noises, several)
+    if not isinstance(noise, Mapping):
+        if len(several.bases) > 1:
+            raise InputError(f"noise: give one for each of {', '.join(several.bases)}, by name")
+        noise = {several.bases[0]: noise}
+    expanded = several.expand(noise, "noise")
+    for name in several.parts:
+        if name not in expanded:
+            raise InputError(f"noise: nothing for '{name}'; observed: {', '.join(several.parts)}")
     restricted = forward.at(several.nodes)
     states, priors = load_states(forward.scene, several.states, prior, known)
     check_known(restricted, states)
@@ -370,30 +366,14 @@ def model(
         forward=restricted,
         full=forward,
         observe=several,
-        noise=noises,
-        noise_names=names,
+        noise=at_sites({name: each for name, (_, each) in expanded.items()}, several),
+        noise_names={name: source for name, (source, _) in expanded.items()},
         states=states,
         prior=cut_priors,
         prior_cut=cut,
         check_scale=check_scale,
         dependence=None if dependence is None else dependence.ordered(states.unknowns),
     )
-
-
-def _noises(
-    observe: Observations, noise: Noise | Mapping[str, Noise]
-) -> tuple[dict[str, str], dict[str, Noise]]:
-    """Return the name under which each observation's noise was given, and the noise."""
-    if not isinstance(noise, Mapping):
-        if len(observe.bases) > 1:
-            raise InputError(f"noise: give one for each of {', '.join(observe.bases)}, by name")
-        noise = {observe.bases[0]: noise}
-    expanded = observe.expand(noise, "noise")
-    for name in observe.parts:
-        if name not in expanded:
-            raise InputError(f"noise: nothing for '{name}'; observed: {', '.join(observe.parts)}")
-    names = {name: source for name, (source, _) in expanded.items()}
-    return names, {name: each for name, (_, each) in expanded.items()}
 
 
 def at_sites(noise: Mapping[str, Noise], observe: Observations) -> dict[str, Noise]:

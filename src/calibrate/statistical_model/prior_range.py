@@ -36,10 +36,8 @@ def fit_to(forward: ForwardMap, prior: Prior) -> tuple[Prior, dict[str, float]]:
 
     A name is a parameter, or a parameter in a load state (:mod:`calibrate.state_names`).
 
-    Raises
-    ------
-    InputError
-        A prior with more than :data:`NEGLIGIBLE` of its mass where the map has no answer.
+    :class:`InputError` for a prior with more than :data:`NEGLIGIBLE` of its mass where the map has
+    no answer.
     """
     cut: dict[str, float] = {}
     for name, distribution in prior.items():
@@ -50,8 +48,9 @@ def fit_to(forward: ForwardMap, prior: Prior) -> tuple[Prior, dict[str, float]]:
         if not tails or all(_answers(forward, k, value) for value in tails):
             continue
         if mass > NEGLIGIBLE:
+            share = f"{100.0 * mass:{'.2g' if mass < 0.995 else '.4g'}} %"
             raise InputError(
-                f"prior of '{name}' has {_percent(mass)} of its mass outside "
+                f"prior of '{name}' has {share} of its mass outside "
                 f"{parameter.low:g} to {parameter.high:g} {parameter.unit}".rstrip()
                 + f", where forward map '{forward.kind}' has no answer: cut it yourself with "
                 "cal.truncated(prior, scene), or use FEM or a scene of wider range"
@@ -74,10 +73,6 @@ def check_known(forward: ForwardMap, states: LoadStates) -> None:
                     + f"; forward map '{forward.kind}' answers from {parameter.low:g} to "
                     f"{parameter.high:g}: use FEM or a scene of wider range"
                 )
-
-
-def _percent(mass: float) -> str:
-    return f"{100.0 * mass:.2g} %" if mass < 0.995 else f"{100.0 * mass:.4g} %"
 
 
 def _tails(parameter: Parameter, prior: dist.Distribution) -> Iterator[tuple[float, float]]:
@@ -133,11 +128,6 @@ class Standardised(dist.Distribution):
             prior.support, float(np.median(unconstrained)), float(unconstrained.std())
         )
         super().__init__(batch_shape=(), event_shape=())
-
-    @property
-    def support(self) -> constraints.Constraint:
-        """The prior's support, with the standardised coordinate."""
-        return self._support
 
     def log_prob(self, value: ArrayLike) -> jax.Array:
         """Return the log density of the prior."""

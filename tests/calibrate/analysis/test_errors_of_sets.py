@@ -1,6 +1,5 @@
 """Errors that many numbers share, before data: dense covariances, and posteriors on grids."""
 
-import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
 import pytest
@@ -9,7 +8,7 @@ from scipy.stats import halfnorm
 import calibrate as cal
 from calibrate.analysis.expected import expected_precision
 from calibrate.analysis.identifiability import prior_table
-from calibrate.model_error.systematic import Systematic, curve_covariance
+from calibrate.model_error.systematic import Systematic, curve_correlation
 from emulator.core.errors import InputError
 from linear_support import linear_forward
 from scene_support import block
@@ -111,7 +110,7 @@ def test_sds_are_those_of_posteriors_whose_share_is_inferred():
     model = curve(count, prior, noise)
     found = expected_precision(model, systematic=words, data_sets=128)["sd"]["lam"]
     rng, at = np.random.default_rng(2), 2.0 + np.arange(count) / count
-    shape = np.asarray(curve_covariance(jnp.asarray(at), jnp.ones(count), 0.4, share=1.0))
+    shape = curve_correlation(at, 0.4)
     root = np.linalg.cholesky(shape)
     log_lam = np.log(5.0) + 0.5 * np.linspace(-4.0, 4.0, 401)
     shares = halfnorm(scale=0.1).ppf((np.arange(150) + 0.5) / 150)

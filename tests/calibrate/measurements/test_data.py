@@ -4,7 +4,7 @@ import xarray as xr
 
 import calibrate as cal
 from calibrate.measurements import observations, spread_landmarks
-from calibrate.measurements.data import read_data, write_data
+from calibrate.measurements.data import read_measurements, write_data
 from emulator.core.errors import InputError
 
 VALUES = np.array([[0.1, 0.2, -3.0], [1.0, -2.0, 1e-7]])
@@ -16,7 +16,7 @@ def test_csv_round_trip(beam, tmp_path):
         cal.landmarks(beam, [[10.0, 5.0, 5.0], [60.0, 1.0, 2.0]]),
     ):
         write_data(tmp_path / "d.csv", observe, VALUES)
-        back, values = read_data(beam, tmp_path / "d.csv")
+        back, values = read_measurements(beam, tmp_path / "d.csv")[:2]
         (name,) = values
         np.testing.assert_array_equal(values[name], VALUES)
         np.testing.assert_array_equal(back.parts[name].points, observe.points)
@@ -28,7 +28,7 @@ def test_netcdf(beam, tmp_path):
         {"displacement": (("point", "component"), VALUES)}, coords={"node": ("point", [7, 30])}
     )
     data.to_netcdf(tmp_path / "d.nc", engine="h5netcdf")
-    observe, values = read_data(beam, tmp_path / "d.nc")
+    observe, values = read_measurements(beam, tmp_path / "d.nc")[:2]
     np.testing.assert_array_equal(observe.nodes, [7, 30])
     np.testing.assert_array_equal(values["displacement"], VALUES)
     data.drop_vars("node").to_netcdf(tmp_path / "e.nc", engine="h5netcdf")
@@ -36,10 +36,10 @@ def test_netcdf(beam, tmp_path):
         InputError,
         match="variable 'node' is missing; expected variables node,displacement or position",
     ):
-        read_data(beam, tmp_path / "e.nc")
+        read_measurements(beam, tmp_path / "e.nc")
     (tmp_path / "f.nc").write_bytes((tmp_path / "d.nc").read_bytes()[:200])
     with pytest.raises(InputError, match="neither CSV .* nor readable netCDF"):
-        read_data(beam, tmp_path / "f.nc")
+        read_measurements(beam, tmp_path / "f.nc")
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_netcdf(beam, tmp_path):
 def test_one_line_for_every_mistake(beam, tmp_path, text, message):
     (tmp_path / "d.csv").write_text(text)
     with pytest.raises(InputError, match=message) as caught:
-        read_data(beam, tmp_path / "d.csv")
+        read_measurements(beam, tmp_path / "d.csv")
     assert "\n" not in str(caught.value)
     assert "d.csv" in str(caught.value)
 
@@ -85,7 +85,7 @@ def test_a_volume_beside_displacements_survives_a_csv_file(ventricle, points, tm
     for parts in (several, alone, named, {**several, **named}):
         given = {name: data[name] for name in parts}
         write_data(tmp_path / "d.csv", observations(parts), given)
-        back, values = read_data(ventricle, tmp_path / "d.csv")
+        back, values = read_measurements(ventricle, tmp_path / "d.csv")[:2]
         assert list(back.parts) == list(values) == list(parts)
         for name in parts:
             np.testing.assert_array_equal(values[name], given[name])
@@ -95,7 +95,7 @@ def test_a_volume_beside_displacements_survives_a_csv_file(ventricle, points, tm
 def test_a_volume_written_beside_the_first_point(ventricle, tmp_path):
     text = "node,ux,uy,uz,volume\n30,1,2,3,140.5\n31,4,5,6,\n"
     (tmp_path / "d.csv").write_text(text)
-    back, values = read_data(ventricle, tmp_path / "d.csv")
+    back, values = read_measurements(ventricle, tmp_path / "d.csv")[:2]
     np.testing.assert_array_equal(values["displacement"], [[1, 2, 3], [4, 5, 6]])
     assert values["volume"] == 140.5
     np.testing.assert_array_equal(back.parts["displacement"].nodes, [30, 31])
@@ -110,14 +110,14 @@ def test_a_volume_in_netcdf(ventricle, points, tmp_path):
         }
     )
     data.to_netcdf(tmp_path / "d.nc", engine="h5netcdf")
-    back, values = read_data(ventricle, tmp_path / "d.nc")
+    back, values = read_measurements(ventricle, tmp_path / "d.nc")[:2]
     assert values["volume"] == 123.4
     np.testing.assert_array_equal(back.parts["displacement"].points, points)
     data[["volume"]].to_netcdf(tmp_path / "v.nc", engine="h5netcdf")
-    assert list(read_data(ventricle, tmp_path / "v.nc")[0].parts) == ["volume"]
+    assert list(read_measurements(ventricle, tmp_path / "v.nc")[0].parts) == ["volume"]
     data.assign(volume=("point", [1.0, 2.0])).to_netcdf(tmp_path / "w.nc", engine="h5netcdf")
     with pytest.raises(InputError, match="volume has 2 values; give one, in mL"):
-        read_data(ventricle, tmp_path / "w.nc")
+        read_measurements(ventricle, tmp_path / "w.nc")
 
 
 @pytest.mark.parametrize(
@@ -136,7 +136,7 @@ def test_a_volume_in_netcdf(ventricle, points, tmp_path):
 def test_one_line_for_every_mistake_with_a_volume(ventricle, tmp_path, text, message):
     (tmp_path / "d.csv").write_text(text)
     with pytest.raises(InputError, match=message) as caught:
-        read_data(ventricle, tmp_path / "d.csv")
+        read_measurements(ventricle, tmp_path / "d.csv")
     assert "\n" not in str(caught.value)
     assert "d.csv" in str(caught.value)
 
@@ -172,7 +172,7 @@ NODES = "node,ux,uy,uz\n7,0.5,-2.25,3\n30,1,2,1e-7\n"
 )
 def test_dialects_of_csv(beam, tmp_path, text):
     (tmp_path / "d.csv").write_text(text, encoding="utf-8", newline="")
-    observe, data = read_data(beam, tmp_path / "d.csv")
+    observe, data = read_measurements(beam, tmp_path / "d.csv")[:2]
     np.testing.assert_array_equal(observe.parts["displacement"].nodes, [7, 30])
     np.testing.assert_array_equal(data["displacement"], [[0.5, -2.25, 3.0], [1.0, 2.0, 1e-7]])
 
@@ -195,7 +195,7 @@ def test_dialects_of_csv(beam, tmp_path, text):
 def test_files_that_cannot_be_read(beam, tmp_path, name, content, message):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=message) as caught:
-        read_data(beam, tmp_path / name)
+        read_measurements(beam, tmp_path / name)
     assert "\n" not in str(caught.value)
 
 
@@ -208,7 +208,7 @@ def test_positions_of_the_deformed_body_are_known_as_such(ventricle, points, tmp
         rows = [",".join(map(str, [*x, *v])) for x, v in zip(at, u, strict=True)]
         (tmp_path / "d.csv").write_text("x,y,z,ux,uy,uz\n" + "\n".join(rows))
         with pytest.raises(InputError, match="lies outside the body") as caught:
-            read_data(ventricle, tmp_path / "d.csv")
+            read_measurements(ventricle, tmp_path / "d.csv")
         assert ("all points lie inside: give positions at rest" in str(caught.value)) is hint
 
 
@@ -218,7 +218,7 @@ def test_netcdf_is_written_too(ventricle, points, tmp_path):
         "volume": cal.CavityVolume(ventricle),
     }
     write_data(tmp_path / "d.nc", observations(parts), {"displacement": LANDMARKS, "volume": 9.5})
-    back, values = read_data(ventricle, tmp_path / "d.nc")
+    back, values = read_measurements(ventricle, tmp_path / "d.nc")[:2]
     np.testing.assert_array_equal(values["displacement"], LANDMARKS)
     np.testing.assert_array_equal(back.parts["displacement"].points, points)
     assert values["volume"] == 9.5

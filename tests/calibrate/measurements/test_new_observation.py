@@ -9,7 +9,7 @@ import pytest
 
 import calibrate as cal
 from calibrate.measurements import OBSERVATIONS, Scalar, observations_from_json, parse_observation
-from calibrate.measurements.data import read_data, write_data
+from calibrate.measurements.data import read_measurements, write_data
 from calibrate.posterior.tree import labels_of
 from calibrate.project import Run, make_data
 from emulator.core.errors import InputError
@@ -60,7 +60,7 @@ def test_from_the_command_line_through_model_and_file_and_back(beam, tmp_path):
     data = {name: np.asarray(value) for name, value in seen.items()}
     for file in ("d.csv", "d.nc"):
         write_data(tmp_path / file, observe, data)
-        back, values = read_data(beam, tmp_path / file)
+        back, values = read_measurements(beam, tmp_path / file)[:2]
         assert set(back.parts) == set(observe.parts)
         for name in data:
             np.testing.assert_array_equal(values[name], data[name])
@@ -84,7 +84,7 @@ def test_in_a_model_with_a_noise_of_its_own(beam):
     value = model.predict({"mu": 70.0, "lam": 60.0})[0]["area:3,14,20"]
     checked = model.check_data(np.asarray(value))
     means = model.observe(model.forward(theta[0])[None], theta)
-    density = model.log_density(means, {"area:3,14,20": {"noise_sd": 0.5}}, checked)
+    density = model.log_density({"noise_sd": 0.5}, means, checked)
     assert float(density) == pytest.approx(-np.log(0.5 * np.sqrt(2.0 * np.pi)))
     with pytest.raises(InputError, match=r"area:3,14,20 is -1.0 mm2; it must be above 0"):
         model.check_data(-1.0)

@@ -10,7 +10,6 @@ import pytest
 import calibrate as cal
 from calibrate.measurements import (
     OBSERVATIONS,
-    observation_from_json,
     observations,
     observations_from_json,
     spread_landmarks,
@@ -71,7 +70,7 @@ def test_measured_surface_points_are_on_the_surface_give_or_take(beam):
 
 def test_descriptions_make_the_same_operator(beam):
     for observe in (cal.nodal_displacements(beam, [3, 9]), cal.landmarks(beam, [[10.0, 5.0, 5.0]])):
-        again = observation_from_json(beam, observe.to_json())
+        again = observations_from_json(beam, {"d": observe.to_json()}).parts["d"]
         np.testing.assert_array_equal(again.nodes, observe.nodes)
         np.testing.assert_array_equal(again.points, observe.points)
 
@@ -85,14 +84,14 @@ def test_descriptions_make_the_same_operator(beam):
         ),
         (lambda s: cal.nodal_displacements(s, [-1]), "node -1 is unknown"),
         (lambda s: cal.nodal_displacements(s, [3, 3]), "node 3 is observed twice"),
-        (lambda s: cal.nodal_displacements(s, [0.5]), "must be a list of whole numbers"),
+        (lambda s: cal.nodal_displacements(s, [0.5]), "nodes must be whole numbers"),
         (lambda s: cal.nodal_displacements(s, []), "must be a list of whole numbers, not empty"),
         (lambda s: cal.nodal_displacements(s, "apex"), "node set 'apex' is not in the mesh"),
         (lambda s: cal.landmarks(s, [[1, 1, 1], [500.0, 0, 0]]), "landmark 1 at .* lies outside"),
         (lambda s: cal.landmarks(s, [[np.nan, 1, 1]]), "expected .*finite"),
         (lambda s: spread_nodes(s, 1000, 0), "cannot observe 1000 nodes"),
         (
-            lambda s: observation_from_json(s, {"kind": "smell"}),
+            lambda s: observations_from_json(s, {"nose": {"kind": "smell"}}),
             "observation kind 'smell' is unknown",
         ),
     ],

@@ -8,7 +8,7 @@ import pytest
 import calibrate as cal
 import emulator as em
 from calibrate.measurements import Reaction, observations_from_json, parse_observation
-from calibrate.measurements.data import read_data, write_data
+from calibrate.measurements.data import read_measurements, write_data
 from emulator.core.errors import InputError
 from emulator.surrogates.taylor import expand
 from scene_support import between_plates
@@ -83,7 +83,7 @@ def test_from_words_to_files_and_back(simulator, tmp_path):
     data = dict(zip(observe.parts, map(np.asarray, (0.01, 0.03, -0.002)), strict=True))
     for file in ("d.csv", "d.nc"):
         write_data(tmp_path / file, observe, data)
-        back, values = read_data(simulator.scene, tmp_path / file)
+        back, values = read_measurements(simulator.scene, tmp_path / file)[:2]
         assert {k: float(v) for k, v in values.items()} == {k: float(v) for k, v in data.items()}
         assert list(back.parts) == list(observe.parts)
     again = observations_from_json(simulator.scene, observe.to_json())

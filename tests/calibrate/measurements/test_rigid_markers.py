@@ -12,7 +12,7 @@ from calibrate.measurements import (
     parse_observation,
     rigid_markers,
 )
-from calibrate.measurements.data import read_data, write_data
+from calibrate.measurements.data import read_measurements, write_data
 from emulator.core.errors import InputError
 from emulator.scenes.supports import Support
 from scene_support import between_plates, block, rotation
@@ -70,7 +70,7 @@ def test_from_files_and_back(scene, tmp_path):
     data = {"markers:right@a": np.arange(9.0).reshape(3, 3)}
     for file in ("d.csv", "d.nc"):
         write_data(tmp_path / file, observe, data)
-        back, values = read_data(scene, tmp_path / file)
+        back, values = read_measurements(scene, tmp_path / file)[:2]
         np.testing.assert_array_equal(values["markers:right@a"], data["markers:right@a"])
         np.testing.assert_array_equal(back.parts["markers:right@a"].points, PINS)
     again = observations_from_json(scene, observe.to_json())

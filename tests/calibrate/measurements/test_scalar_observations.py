@@ -12,7 +12,7 @@ from calibrate.measurements import (
     observations_from_json,
     parse_observation,
 )
-from calibrate.measurements.data import read_data, write_data
+from calibrate.measurements.data import read_measurements, write_data
 from calibrate.noise import CorrelatedNoise
 from calibrate.project import Run
 from emulator.core.errors import InputError
@@ -55,7 +55,7 @@ def test_from_words_to_files_and_back(ventricle, tmp_path):
     data = dict(zip(observe.parts, map(np.asarray, (75.0, 12.5, 1.07, 120.0)), strict=True))
     for file in ("d.csv", "d.nc"):
         write_data(tmp_path / file, observe, data)
-        back, values = read_data(ventricle, tmp_path / file)
+        back, values = read_measurements(ventricle, tmp_path / file)[:2]
         assert {k: float(v) for k, v in values.items()} == {k: float(v) for k, v in data.items()}
         np.testing.assert_array_equal(np.sort(back.nodes), np.sort(observe.nodes))
     again = observations_from_json(ventricle, observe.to_json())
@@ -79,7 +79,7 @@ def test_a_measured_pressure_is_data(ventricle):
 
     def density(model, data):
         u = model.evaluate(thetas).displacement
-        return float(model.log_density(model.observe(u, thetas), model.noise_values({}), data))
+        return float(model.log_density({}, model.observe(u, thetas), data))
 
     change = density(both, data) - density(alone, {"volume": data["volume"]})
     assert change == pytest.approx(-0.5 * 1.5**2 - np.log(0.1 * np.sqrt(2.0 * np.pi)))
@@ -97,7 +97,7 @@ def test_a_measured_pressure_is_data(ventricle):
 def test_volumes_and_pressures_of_frames_are_one_file(ventricle, tmp_path):
     text = "state,volume,parameter:pressure\nf1,110.2,0.61\nf2,124.9,1.18\n"
     (tmp_path / "frames.csv").write_text(text)
-    observe, values = read_data(ventricle, tmp_path / "frames.csv")
+    observe, values = read_measurements(ventricle, tmp_path / "frames.csv")[:2]
     expected = {"volume@f1": 110.2, "parameter:pressure@f1": 0.61, "volume@f2": 124.9, "parameter:pressure@f2": 1.18}  # fmt: skip
     assert {name: float(value) for name, value in values.items()} == expected
     assert set(observe.parts) == set(expected)
@@ -160,4 +160,4 @@ def test_words_that_ask_for_nothing(ventricle, word, message):
 def test_files_that_are_wrong(ventricle, tmp_path, text, message):
     (tmp_path / "d.csv").write_text(text)
     with pytest.raises(InputError, match=message):
-        read_data(ventricle, tmp_path / "d.csv")
+        read_measurements(ventricle, tmp_path / "d.csv")

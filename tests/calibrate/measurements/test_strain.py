@@ -18,9 +18,9 @@ from calibrate.measurements import (
     spread_landmarks,
     strains,
 )
-from calibrate.measurements.data import read_data, write_data
-from calibrate.measurements.local_basis import COMPONENTS, local_directions
-from calibrate.measurements.location import locate, locate_gradients
+from calibrate.measurements.data import read_measurements, write_data
+from calibrate.measurements.location import locate
+from calibrate.measurements.strain import COMPONENTS, local_directions
 from emulator.core.errors import InputError
 from emulator.fem.fields import element_fields
 from emulator.geometry.discretisation import quadrature_points
@@ -47,7 +47,7 @@ def seen(observe, scene, u):
 
 def directions_at(scene, components, points):
     """Unit vectors (d, c, 3): in an element linear through those at its quadrature points."""
-    element, inside, _ = locate_gradients(scene.mesh, points)
+    element, inside = locate(scene.mesh, points)
     e = local_directions(scene, components)[element]
     if scene.mesh.order == 1:
         return e[:, 0]
@@ -161,7 +161,7 @@ def test_words_files_json_and_batches(ventricle, tmp_path):
     one["strain"][2] = one["strain"][4, 0] = np.nan
     for file in ("d.csv", "d.nc"):
         write_data(tmp_path / file, observe, one)
-        back, values = read_data(ventricle, tmp_path / file)
+        back, values = read_measurements(ventricle, tmp_path / file)[:2]
         assert set(back.parts) == set(observe.parts)
         for name in one:
             np.testing.assert_array_equal(values[name], one[name])
@@ -246,4 +246,4 @@ def test_what_cannot_be_observed(ventricle, beam):
 def test_files_that_are_wrong(ventricle, tmp_path, text, message):
     (tmp_path / "d.csv").write_text(text)
     with pytest.raises(InputError, match=message):
-        read_data(ventricle, tmp_path / "d.csv")
+        read_measurements(ventricle, tmp_path / "d.csv")

@@ -16,7 +16,7 @@ from calibrate.measurements import (
     surface_distances,
     surface_points,
 )
-from calibrate.measurements.data import read_data, write_data
+from calibrate.measurements.data import read_measurements, write_data
 from calibrate.measurements.location import closest_point, facet_shapes
 from emulator.core.errors import InputError
 from emulator.geometry.generators.ellipsoid import human_ventricle
@@ -43,7 +43,8 @@ def test_the_foot_is_the_closest_point(scene, facet_set):
     facets = scene.mesh.nodes[scene.mesh.facet_set(facet_set)]
     rng = np.random.default_rng(0)
     for point in spread_on_surface(scene, facet_set, 3, seed=1) + rng.normal(0.0, 2.0, (3, 3)):
-        foot = closest_point(facets, point)
+        row, inside = closest_point(facets, point)
+        foot = facet_shapes(inside[None], facets.shape[1])[0][0] @ facets[row]
 
         def distance(y, facet, point=point):
             L = np.abs(y) / np.abs(y).sum()
@@ -61,7 +62,7 @@ def test_the_foot_is_the_closest_point(scene, facet_set):
             ).fun
             for facet in near
         ]
-        assert np.linalg.norm(foot.position - point) == pytest.approx(min(found), abs=1e-5)
+        assert np.linalg.norm(foot - point) == pytest.approx(min(found), abs=1e-5)
 
 
 def test_a_translation_moves_a_surface_by_its_normal_component(scene, strict):
@@ -115,7 +116,7 @@ def test_words_files_json(ventricle, tmp_path):
     data["surface:epicardium"][2] = np.nan
     for file in ("d.csv", "d.nc"):
         write_data(tmp_path / file, observe, data)
-        back, values = read_data(ventricle, tmp_path / file)
+        back, values = read_measurements(ventricle, tmp_path / file)[:2]
         assert set(values) == set(data)
         for name in data:
             np.testing.assert_array_equal(values[name], data[name])

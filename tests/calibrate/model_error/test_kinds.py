@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal
 import calibrate as cal
 from calibrate.model_error import ModelError, Systematic
 from calibrate.model_error.kinds import Measured, read_systematic, rotation_of
-from calibrate.model_error.systematic import curve_covariance
+from calibrate.model_error.systematic import curve_correlation
 from calibrate.statistical_model.errors import with_described_errors
 from emulator.core.errors import InputError
 from emulator.scenes import Scene
@@ -201,7 +201,7 @@ def test_a_share_that_is_inferred_after_errors_of_known_sds_is_the_dense_covaria
     predicted = np.full(4, 5.2)
     gain = 0.01 * predicted
     for share in (0.02, 0.2):
-        law = curve_covariance(at, predicted, 0.4, share=share, constant=0.5)
+        law = share**2 * np.outer(predicted, predicted) * curve_correlation(at, 0.4, 0.5)
         C = 1e-6 * np.eye(4) + np.outer(gain, gain) + np.asarray(law)
         draw = {"lam": jnp.asarray(5.2), "curve_share": jnp.asarray(share)}
         expected = multivariate_normal(predicted, C).logpdf(values)

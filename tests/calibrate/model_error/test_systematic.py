@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
 import calibrate as cal
+from calibrate.model_error.kinds import read_systematic
 from calibrate.model_error.systematic import (
     Systematic,
-    check_curve,
-    curve_covariance,
+    curve_correlation,
     curve_modes,
 )
 from calibrate.noise import information_about_means
@@ -179,6 +179,10 @@ AT = np.array([0.0, 0.1, 0.3, -0.2])
 VALUES = np.array([1.0, 2.0, 4.0, -1.5])
 
 
+def curve_covariance(at, values, length, share=0.0, sd=0.0, constant=0.0):
+    return (share**2 * np.outer(values, values) + sd**2) * curve_correlation(at, length, constant)
+
+
 def test_one_entry_by_hand():
     """Points 0.1 and 0.3 apart by one length: (1 + sqrt 3) exp(-sqrt 3) of Matern's kernel."""
     C = curve_covariance(AT, VALUES, 0.2, share=0.1, sd=0.05, constant=0.25)
@@ -203,16 +207,16 @@ def test_a_curve_that_is_off_as_one_has_one_mode():
 
 
 def test_what_no_curve_can_be():
-    with pytest.raises(InputError, match="length is 0; it must be above 0"):
-        check_curve(0, 0.5)
+    curve = {"kind": "curve", "of": "a", "along": "b"}
+    with pytest.raises(InputError, match="length is 0.0; it must be above 0"):
+        read_systematic("e", {**curve, "length": 0, "constant": 0.5})
     with pytest.raises(InputError, match=r"constant is 1.5; it is a part, 0 to 1"):
-        check_curve(0.1, 1.5)
+        read_systematic("e", {**curve, "length": 0.1, "constant": 1.5})
 
 
 def test_several_curves_at_once():
-    at, values = np.stack([AT, 2.0 * AT]), np.stack([VALUES, -VALUES])
-    lengths = np.array([0.2, 0.4])[:, None, None]
-    found = curve_covariance(at, values, lengths, share=0.1, constant=0.5)
-    for C, a, y, length in zip(found, at, values, (0.2, 0.4), strict=True):
-        one = curve_covariance(a, y, length, share=0.1, constant=0.5)
+    at, lengths = np.stack([AT, 2.0 * AT]), np.array([0.2, 0.4])[:, None, None]
+    found = curve_correlation(at, lengths, 0.5)
+    for C, a, length in zip(found, at, (0.2, 0.4), strict=True):
+        one = curve_correlation(a, length, 0.5)
         np.testing.assert_allclose(C, one, rtol=1e-14)

@@ -28,11 +28,10 @@ def estimate(model, data, numbers):
     """Least-squares theta and its covariance, from the density's derivatives: it is Gaussian."""
     checked = model.check_data(data)
     values = {name: jnp.asarray(v) for name, v in numbers.items()}
-    (name,) = model.observe.parts
 
     def density(theta):
         u = model.forward(theta)[None]
-        return model.log_density(model.observe(u, theta[None]), {name: values}, checked)
+        return model.log_density(values, model.observe(u, theta[None]), checked)
 
     covariance = np.linalg.inv(-np.asarray(jax.hessian(density)(TRUTH)))
     return np.asarray(TRUTH) + covariance @ np.asarray(jax.grad(density)(TRUTH)), covariance
@@ -70,10 +69,10 @@ def test_its_size_is_inferred_and_vanishes_where_the_model_is_right(beam, bent):
 
         def density(sd, values=values, checked=checked):
             theta, _ = estimate(model, values, {"discrepancy_sd": sd})
-            numbers = {"displacement": {"discrepancy_sd": jnp.asarray(sd)}}
+            numbers = {"discrepancy_sd": jnp.asarray(sd)}
             u = model.forward(jnp.asarray(theta))[None]
             means = model.observe(u, jnp.asarray(theta)[None])
-            return float(model.log_density(means, numbers, checked))
+            return float(model.log_density(numbers, means, checked))
 
         best[name] = sds[np.argmax([density(sd) for sd in sds])]
     assert best["right"] < 0.03 < 0.1 < best["wrong"] < 1.0

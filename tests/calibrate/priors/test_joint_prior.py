@@ -13,11 +13,12 @@ from scipy import stats
 import calibrate as cal
 from calibrate.posterior import predictions
 from calibrate.priors import Dependence, JointPrior
-from calibrate.priors.population import POPULATIONS, prior_of, read_population
+from calibrate.priors.population import POPULATIONS, prior_of
 from calibrate.priors.priors import Conditional
 from calibrate.project import Run
 from calibrate.samplers.density import density_of
 from emulator.core.errors import InputError
+from emulator.core.schema import read_json_as
 from emulator.scenes.built_in.ventricles import left_ventricle
 from linear_support import linear_forward
 
@@ -187,7 +188,7 @@ def test_a_run_takes_names_files_and_numbers(tmp_path, beam):
     )
     path = tmp_path / "cohort.json"
     path.write_text(json.dumps(numbers))
-    assert asdict(read_population(path)) == numbers
+    assert asdict(read_json_as(cal.Population, path)) == numbers
     assert Run("once_clamped_beam", prior=numbers).prior == numbers
     found = prior_of(numbers, beam)
     assert found.dependence.correlation[0, 1] == 0.5
@@ -198,7 +199,7 @@ def test_a_run_takes_names_files_and_numbers(tmp_path, beam):
         prior_of("ventricles", beam)
     path.write_text(json.dumps({**numbers, "correlation": {"mu,nu": 0.5}}))
     with pytest.raises(InputError, match="correlation 'mu,nu': give two of mu, lam"):
-        read_population(path)
+        read_json_as(cal.Population, path)
 
 
 @pytest.mark.slow

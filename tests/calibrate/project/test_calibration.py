@@ -28,7 +28,7 @@ class Stopped(Exception):
 def count(monkeypatch):
     """Count the scenes that are built and the data files that are opened; the beam is coarse."""
     counts = Counter()
-    open_data = reader.open_data
+    read_csv = reader.read_csv
 
     def build(**_):
         counts["scene"] += 1
@@ -36,10 +36,10 @@ def count(monkeypatch):
 
     def opened(path):
         counts["data"] += 1
-        return open_data(path)
+        return read_csv(path)
 
     monkeypatch.setitem(BUILT_IN, BEAM, build)
-    monkeypatch.setattr(reader, "open_data", opened)
+    monkeypatch.setattr(reader, "read_csv", opened)
     return counts
 
 
@@ -62,7 +62,7 @@ def test_few_frames_lie_between_a_command_and_its_data_and_its_likelihood():
     assert len(parse) <= 8
     assert len(likelihood) <= 9
     assert len(dict.fromkeys([*parse, *likelihood])) <= 15
-    assert parse[-1].function == "CSVTable.__init__"
+    assert parse[-1].function == "read_csv"
     assert likelihood[-1].function == "Model.distributions"
 
 

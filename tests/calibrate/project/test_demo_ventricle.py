@@ -10,7 +10,7 @@ import pytest
 
 import emulator as em
 from calibrate.cli import main
-from calibrate.measurements.data import read_data
+from calibrate.measurements.data import read_measurements
 from calibrate.posterior import read_tree
 from calibrate.project import demo as demos
 from calibrate.project import read_posterior, simulator_of
@@ -85,7 +85,7 @@ def test_its_files_hold_both_observations(folder):
         "sd": 1.0,
         "sd_scale": None,
     }
-    observe, data = read_data(scene, folder / "data.csv")
+    observe, data = read_measurements(scene, folder / "data.csv")[:2]
     assert list(observe.parts) == ["displacement", "volume"]
     np.testing.assert_array_equal(data["volume"], tree["observed_data"]["volume"])
     # The data is FEM at the truth, within the noise.
@@ -104,7 +104,7 @@ def test_its_folder_is_read_back(folder):
     run, posterior = read_posterior(folder)
     assert run == RUN
     assert float(posterior.data["volume"]) == float(
-        read_data(COARSE(), folder / "data.csv")[1]["volume"]
+        read_measurements(COARSE(), folder / "data.csv")[1]["volume"]
     )
 
 

@@ -113,7 +113,7 @@ def test_a_posterior_with_gaps_and_a_discrepancy_is_kept_and_read(tmp_path):
     thetas = back.model.states.thetas(draw)
     u = back.model.evaluate(thetas).displacement
     densities = [
-        float(p.model.log_density(p.model.observe(u, thetas), p.model.noise_values(draw), p.data))
+        float(p.model.log_density(draw, p.model.observe(u, thetas), p.data))
         for p in (posterior, back)
     ]
     assert densities[0] == pytest.approx(densities[1], rel=1e-12)

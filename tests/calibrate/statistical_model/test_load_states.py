@@ -10,7 +10,7 @@ from numpyro.infer.util import log_density
 
 import calibrate as cal
 from calibrate.measurements import observations, parse_observation, spread_landmarks
-from calibrate.measurements.data import read_data, write_data
+from calibrate.measurements.data import read_measurements, write_data
 from calibrate.project import Run, make_data
 from calibrate.statistical_model.load_states import known_thetas, load_states
 from emulator.core.errors import InputError
@@ -173,7 +173,7 @@ def test_files_keep_states(ventricle, curve, tmp_path, file):
     rng = np.random.default_rng(0)
     data = {n: np.abs(rng.normal(size=shape)) for n, shape in observe.shapes.items()}
     write_data(tmp_path / file, observe, data)
-    back, values = read_data(ventricle, tmp_path / file)
+    back, values = read_measurements(ventricle, tmp_path / file)[:2]
     assert back.states == ("low", "high")
     assert set(back.parts) == set(observe.parts)
     for name in data:
@@ -186,7 +186,7 @@ def test_files_keep_states(ventricle, curve, tmp_path, file):
 def test_a_pressure_volume_curve_as_people_write_it(ventricle, tmp_path):
     path = tmp_path / "curve.csv"
     path.write_text("state;volume\nED;120,5\nES;60\n")
-    observe, data = read_data(ventricle, path)
+    observe, data = read_measurements(ventricle, path)[:2]
     assert {k: float(v) for k, v in data.items()} == {"volume@ED": 120.5, "volume@ES": 60.0}
     assert observe.states == ("ED", "ES")
 
@@ -207,7 +207,7 @@ def test_files_with_states_that_are_wrong(ventricle, tmp_path, text, message):
     path = tmp_path / "d.csv"
     path.write_text(text)
     with pytest.raises(InputError, match=message):
-        read_data(ventricle, path)
+        read_measurements(ventricle, path)
 
 
 @pytest.mark.parametrize(

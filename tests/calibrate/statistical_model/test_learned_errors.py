@@ -12,9 +12,9 @@ from scipy.stats import multivariate_normal
 
 import calibrate as cal
 from calibrate.model_error import ModelError
-from calibrate.model_error.learned import fit
 from calibrate.posterior import sample
 from calibrate.statistical_model import with_error
+from calibrate.statistical_model.errors import fit
 from emulator.core.errors import InputError
 from linear_support import LinearSimulator, closed_form, linear_forward
 
