@@ -59,11 +59,6 @@ class PointObservation(Observation):
         return tuple(field.named(*selection) for field in (cls.place_field, *cls.value_fields))
 
     @classmethod
-    def selections(cls, words: Collection[str]) -> list[tuple[Any, ...]]:
-        """Return the selections that the columns or variables ``words`` of a file name."""
-        return [()]
-
-    @classmethod
     def located(
         cls, scene: Scene, selection: tuple[Any, ...], places: np.ndarray, values: np.ndarray
     ) -> Self:
@@ -149,9 +144,8 @@ class PointObservation(Observation):
 
     @classmethod
     def tables(cls, words: Collection[str]) -> dict[str, Table]:
-        """Return one table for each selection."""
-        every = cls.selections(words)
-        return {cls.name.format(*s): Table(s, cls.fields(*s)) for s in every}
+        """Return the one table of a kind whose only arguments are the places."""
+        return {cls.name: Table((), cls.fields())}
 
     @classmethod
     def read(

@@ -40,7 +40,7 @@ from emulator.scenes.cavities import ENDOCARDIUM
 
 from calibrate.measurements.displacements import spread_landmarks
 from calibrate.measurements.location import gradients_at, locate
-from calibrate.measurements.observation import Block, Field
+from calibrate.measurements.observation import Block, Field, Table
 from calibrate.measurements.points import XYZ, PointObservation, as_points, gather
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import from_quadrature_points
@@ -101,10 +101,11 @@ class Strains(PointObservation):
         return (cls.place_field, *(Field(column, (column,)) for column in columns))
 
     @classmethod
-    def selections(cls, words: Collection[str]) -> list[tuple[Any, ...]]:
-        """Return the components that columns name, or one as an example if there are none."""
-        components = tuple(c for c, column in COMPONENTS.items() if cls.prefix + column in words)
-        return [(components or ("circumferential",),)]
+    def tables(cls, words: Collection[str]) -> dict[str, Table]:
+        """Return the table of the components in columns, of one as an example if there are none."""
+        found = tuple(c for c, column in COMPONENTS.items() if cls.prefix + column in words)
+        components = found or ("circumferential",)
+        return {cls.name: Table((components,), cls.fields(components))}
 
     def block(self, name: str, values: np.ndarray) -> Block:
         """Return the places, and the components in the order of the basis."""

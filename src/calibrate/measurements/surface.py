@@ -40,7 +40,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibrate.measurements.location import closest_point, facet_shapes
-from calibrate.measurements.observation import LENGTH_UNITS, Field
+from calibrate.measurements.observation import LENGTH_UNITS, Field, Table
 from calibrate.measurements.points import (
     XYZ,
     DisplacementPoints,
@@ -74,12 +74,13 @@ class OfFacetSet(PointObservation):
     arguments = ("facet_set", "points")
 
     @classmethod
-    def selections(cls, words: Collection[str]) -> list[tuple[Any, ...]]:
-        """Return the facet sets that columns name, or a placeholder if only the kind is named."""
+    def tables(cls, words: Collection[str]) -> dict[str, Table]:
+        """Return a table for each facet set in columns; a placeholder if only the kind is named."""
         (field,) = cls.value_fields
         prefixes = [name.format("") for name in (field.variable, *field.columns)]
         sets = {w.removeprefix(p): None for w in words for p in prefixes if w.startswith(p)}
-        return [(name,) for name in sets or (("FACETSET",) if cls.kind in words else ())]
+        named = sets or (("FACETSET",) if cls.kind in words else ())
+        return {cls.name.format(name): Table((name,), cls.fields(name)) for name in named}
 
 
 @dataclass(frozen=True, eq=False)
