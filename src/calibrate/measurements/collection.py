@@ -80,8 +80,6 @@ class Observations:
     def __call__(self, displacement: jax.Array, thetas: jax.Array) -> dict[str, jax.Array]:
         """Return the data of each part without noise.
 
-        Parameters
-        ----------
         displacement : the displacement of ``nodes`` in every load state, mm, (..., S, k, 3).
         thetas : theta in every load state, (..., S, p).
         """

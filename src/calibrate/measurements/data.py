@@ -61,11 +61,9 @@ def read_measurements(
     such as a loading curve ``pull``, has those of ``pull.1``, ``pull.2`` and so on. Parameters are
     known from columns ``known:NAME``, and returned by ``parameter@state``.
 
-    Raises
-    ------
-    InputError
-        Missing or malformed file, a place that is not finite, an infinite value, an unknown node, a
-        point outside, an unknown cavity, a known value that differs within one load state.
+    :class:`InputError` for a missing or malformed file, a place that is not finite, an infinite
+    value, an unknown node, a point outside, an unknown cavity, a known value that differs within
+    one load state.
     """
     parts: dict[str, Observation] = {}
     data: dict[str, np.ndarray] = {}
@@ -146,10 +144,7 @@ def write_data(
 ) -> None:
     """Write data by name: netCDF where ``path`` ends in ``.nc``, CSV otherwise.
 
-    Raises
-    ------
-    InputError
-        An observation under a name that its kind cannot have in a file.
+    :class:`InputError` for an observation under a name that its kind cannot have in a file.
     """
     observe = observations(observe)
     data = observe.name(values, "data")

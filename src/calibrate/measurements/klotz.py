@@ -186,8 +186,6 @@ class KlotzVolume(Scalar):
 def klotz_of(scene: Scene, volume: Any, pressure: Any) -> Klotz | None:
     """Return the relation behind a scene's curve; None for muscle that may contract.
 
-    Parameters
-    ----------
     volume : the volume of the scene's cavity, mL.
     pressure : the pressure there, kPa. None is returned for numbers out of the relation's range.
     """

@@ -53,8 +53,6 @@ def check_magnitudes(
 ) -> None:
     """Raise :class:`InputError` where ``data`` is far from every prediction.
 
-    Parameters
-    ----------
     predict : predictions without noise, and whether they are valid.
     observe : the observations.
     sd : the largest plausible sd of each observation's noise and other errors, in its unit.

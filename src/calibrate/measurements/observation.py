@@ -107,8 +107,6 @@ class Observation(ABC):
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the data without noise and without gaps, (..., *shape), in one load state.
 
-        Parameters
-        ----------
         displacement : the displacement of ``nodes``, mm, (..., k, 3).
         theta : the parameters in the order of the scene's ``parameter_names``, (..., p).
         """

@@ -37,8 +37,6 @@ class Outputs:
 
     Programs are compiled once.
 
-    Parameters
-    ----------
     forward : the forward map.
     parts : the observations, by name.
     field : whether to observe every node's displacement, too.
@@ -140,8 +138,6 @@ def mesh_errors(
 ) -> dict[str, dict[str, Any]]:
     """Return the value and the mesh's error of each observation, by name.
 
-    Parameters
-    ----------
     error, estimate : the simulators on both meshes, and their displacements at one theta.
     observe : words as of ``calibrate infer``; by default 24 landmarks, and the volume of a cavity
         whose wall is called ``endocardium``.

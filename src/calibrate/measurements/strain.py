@@ -261,11 +261,8 @@ def _slopes(gradients: np.ndarray, directions: np.ndarray) -> np.ndarray:
 def local_directions(scene: Scene, components: Sequence[str]) -> np.ndarray:
     """Return unit vectors (m, q, c, 3) along ``components`` at the quadrature points.
 
-    Raises
-    ------
-    InputError
-        An unknown component or one that is given twice; a fibre direction where the scene has no
-        fibres; another direction where it has no wall.
+    :class:`InputError` for an unknown component or one that is given twice, a fibre direction where
+    the scene has no fibres, or another direction where it has no wall.
     """
     for name in components:
         if name not in COMPONENTS:

@@ -75,8 +75,6 @@ class CSVTable:
     def arrays(self, fields: Sequence[Field], others: Collection[str]) -> dict[str, np.ndarray]:
         """Return arrays of numbers by variable, NaN where a measured value is missing.
 
-        Parameters
-        ----------
         fields : the fields of an observation; the file has every word of theirs.
         others : columns of what other observations measured at the same places; a row without
             measured values of ``fields`` that has values there is theirs.

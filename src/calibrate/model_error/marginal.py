@@ -159,8 +159,6 @@ class ModelError:
     def log_ratio(self, unknowns: jax.Array, residual: Means, means: Means) -> jax.Array:
         """Return what the errors add to the log likelihood of ``residual``, data less ``means``.
 
-        Parameters
-        ----------
         unknowns : theta's unknowns (q,), then the size of :attr:`priors` if one is inferred.
         """
         flat, _ = ravel_pytree(dict(residual))
@@ -289,8 +287,6 @@ class ModelError:
 def diagonal(modes: np.ndarray, information: np.ndarray) -> tuple[np.ndarray, ...]:
     """Return fixed modes of the same covariance with a diagonal G.
 
-    Parameters
-    ----------
     modes : the modes as they are declared, (s, d).
     information : W, (d, d).
 

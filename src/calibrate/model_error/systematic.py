@@ -83,8 +83,6 @@ def marginalised(
 ) -> ModelError:
     """Return ``errors`` together, integrated out.
 
-    Parameters
-    ----------
     shapes : shape of each observation's data, by name.
     information : information of the noise about the data's means, (d, d).
     unknowns : names of the model's unknowns, which a size that is inferred may not have.

@@ -60,15 +60,10 @@ class DiscrepancyNoise(SpatialNoise):
 def with_discrepancy(noise: Noise, options: Mapping[str, Any]) -> DiscrepancyNoise:
     """Return ``noise`` and a discrepancy.
 
-    Parameters
-    ----------
     noise : independent Gaussian noise.
     options : ``scale``, ``length`` and perhaps ``kernel`` of a :class:`DiscrepancyNoise`.
 
-    Raises
-    ------
-    InputError
-        Noise of another kind, or options that are wrong.
+    :class:`InputError` for noise of another kind, or options that are wrong.
     """
     if noise.kind != GaussianNoise.kind:
         raise InputError(

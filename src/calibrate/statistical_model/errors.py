@@ -69,8 +69,6 @@ def with_described_errors(
 ) -> tuple[Model, Mapping[str, jax.Array]]:
     """Return ``model`` of the values that are not missing, with the described errors, and these.
 
-    Parameters
-    ----------
     data : the data by the observation's name, NaN where missing.
     descriptions : the description of each error as in an experiment file, by the error's name.
 
@@ -204,8 +202,6 @@ def fit(
 ) -> ModelError:
     """Return the error that FEM runs show.
 
-    Parameters
-    ----------
     unknowns : the unknowns at which FEM was run, (n, q).
     errors : FEM's data less the map's, all observations raveled, (n, d).
     information : the information W of the noise about its mean, (d, d).

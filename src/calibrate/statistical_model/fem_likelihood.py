@@ -84,8 +84,6 @@ class FEMLikelihood:
     ) -> Iterator[tuple[int, Likelihoods]]:
         """Yield numbers of ``draws`` and their log likelihoods, as they are finished.
 
-        Parameters
-        ----------
         stability : numbers of the draws for which ``stable`` is asked, too.
         slopes : whether ``slopes`` are asked for every draw, at a tenth of the time of a solve.
         """

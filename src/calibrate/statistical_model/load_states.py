@@ -67,8 +67,6 @@ def load_states(
 ) -> tuple[LoadStates, dict[str, dist.Distribution]]:
     """Return the states' entries of theta, and the prior of each unknown.
 
-    Parameters
-    ----------
     prior, known : distributions and known values by ``parameter`` or ``parameter@state``; a
         parameter of the loads that is named without a state is meant in every state that is not
         named. A parameter that neither names has the scene's box as its prior.

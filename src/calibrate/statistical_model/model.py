@@ -153,8 +153,6 @@ class Model:
     ) -> None:
         """Run as a NumPyro program.
 
-        Parameters
-        ----------
         data : the data by name, or as they are when one thing is observed.
         prediction : the result of :meth:`evaluate` at the drawn theta, where it is known already.
         """
