@@ -36,7 +36,6 @@ from typing import Any, ClassVar, Self
 import jax
 import jax.numpy as jnp
 import numpy as np
-from emulator.scenes.cavities import ENDOCARDIUM
 
 from calibrate.measurements.displacements import spread_landmarks
 from calibrate.measurements.location import gradients_at, locate
@@ -47,7 +46,7 @@ from emulator.geometry.discretisation import from_quadrature_points
 from emulator.geometry.facets import mean_normal
 from emulator.geometry.fibres import circumferential, unit, wall_depth
 from emulator.geometry.heart_wall import SEGMENTS, aha_segments
-from emulator.scenes.scene import Scene
+from emulator.scenes.scene import ENDOCARDIUM, Scene
 
 _WALL = (ENDOCARDIUM, "epicardium")
 _BASE = "base"
