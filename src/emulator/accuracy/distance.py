@@ -19,8 +19,7 @@ from emulator.fem.formulations.displacement import UNBALANCED
 from emulator.fem.linear import Outcome
 from emulator.fem.load_stepping import LoadStepping
 from emulator.fem.simulator import Simulator
-from emulator.fem.solution import Status
-from emulator.fem.state import NewtonState
+from emulator.fem.solution import NewtonState, Status
 from emulator.scenes.scene import Scene
 
 LARGEST_U = 1e100  # mm; larger displacements count as not finite: J, their cube, would overflow

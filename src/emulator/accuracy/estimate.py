@@ -63,7 +63,7 @@ from emulator.accuracy.distance import (
 from emulator.core.errors import InputError
 from emulator.fem.assembly import System
 from emulator.fem.compiled import compiled, cond
-from emulator.fem.energy import at_points, displacement_gradient
+from emulator.fem.energy import at_points, displacement_gradient, require_shape
 from emulator.fem.simulator import Simulator
 from emulator.mechanics.kinematics import Barriers, Strain
 from emulator.scenes.scene import Scene
@@ -172,7 +172,7 @@ def invariants(
         isochoric = 1.0 + strain.isochoric_I4f_minus_1
         return J, I1, jnp.fmax(jnp.vdot(fibre, fibre), isochoric)
 
-    J, I1, I4f = at_points(measures, scene.tissue_at(theta), displacement_gradient(scene, u))
+    J, I1, I4f = at_points(measures, displacement_gradient(scene, u), scene.tissue_at(theta))
     return J, I1, I4f
 
 
@@ -232,15 +232,15 @@ class ErrorBar:
     def __call__(self, theta: jax.Array) -> ErrorEstimate:
         """Estimate the error of the forward map at ``theta`` (p,), inside the box or not."""
         theta = jnp.asarray(theta, dtype=float)
-        self._check_shape("theta", theta, (len(self.scene.parameters),))
+        require_shape(self.scene, "theta", theta, (len(self.scene.parameters),))
         traced = isinstance(theta, jax.core.Tracer)
         return self.of_field(self.forward(theta) if traced else self._forward(theta), theta)
 
     def of_field(self, u: jax.Array, theta: jax.Array) -> ErrorEstimate:
         """Estimate the error of any displacement ``u`` (n, 3) mm as a prediction at ``theta``."""
         u, theta = jnp.asarray(u, dtype=float), jnp.asarray(theta, dtype=float)
-        self._check_shape("theta", theta, (len(self.scene.parameters),))
-        self._check_shape("displacement", u, self.scene.held.shape)
+        require_shape(self.scene, "theta", theta, (len(self.scene.parameters),))
+        require_shape(self.scene, "displacement", u, self.scene.held.shape)
         state, safe_theta = self._prepare(u, theta)
         return self._finish(u, theta, state, self._distance(state, safe_theta))
 
@@ -252,12 +252,6 @@ class ErrorBar:
             lambda: step,
             lambda: self._error_by_fem(state, theta)._replace(indefinite=step.indefinite),
         )
-
-    def _check_shape(self, name: str, array: jax.Array, expected: tuple[int, ...]) -> None:
-        if array.shape != expected:
-            raise InputError(
-                f"scene '{self.scene.name}': {name} has shape {array.shape}; expected {expected}"
-            )
 
     # ---- compiled parts ------------------------------------------------------------------------
     @cached_property

@@ -20,9 +20,9 @@ where the norms of the forces include the reactions at prescribed displacements.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -30,7 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.errors import InputError
-from emulator.fem.compiled import compiled, is_traced
+from emulator.fem.compiled import Number, compiled, is_traced
 from emulator.fem.condensation import block_derivatives
 from emulator.fem.energy import (
     DeadForce,
@@ -38,11 +38,12 @@ from emulator.fem.energy import (
     dead_force,
     displacement_gradient,
     energy_of_gradient,
+    force_on_body,
+    law_gradients,
     local_forces,
     local_terms,
     pair_products,
     require_rest,
-    seen_by_law,
     spring_terms,
     volume_ratio,
 )
@@ -111,8 +112,8 @@ class System:
         return free
 
     @cached_property
-    def springs(self) -> list[LocalTerm]:
-        """Potentials of the elastic supports."""
+    def springs(self) -> Sequence[LocalTerm | LocalForce]:
+        """Elastic supports; potentials, where :attr:`inverse` is not set."""
         return spring_terms(self.scene)
 
     @cached_property
@@ -128,7 +129,7 @@ class System:
     @cached_property
     def dead(self) -> DeadForce:
         """The dead loads; zero when there are none."""
-        return dead_force(self.scene) or DeadForce(np.zeros(self.scene.held.shape), {})
+        return dead_force(self.scene)
 
     def restrict(self, field: jax.Array) -> jax.Array:
         """Return the free entries (f,) of a nodal field (n, 3)."""
@@ -150,20 +151,15 @@ class System:
     def internal_energy(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the elastic energy of the body and its springs, mN mm."""
         energy = energy_of_gradient(self.scene, displacement_gradient(self.scene, u), theta)
-        if self.springs:
-            values = self.scene.resolve(theta)
-            energy = energy + sum(spring.total(u, values) for spring in self.springs)
-        return energy
+        values = self.scene.resolve(theta)
+        return sum((spring.total(u, values) for spring in self.springs), energy)
 
     internal_force = jax.grad(internal_energy, argnums=1)
     """The gradient of the elastic energy, (n, 3) in mN; at prescribed entries, the reactions."""
 
     def external_force(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the force of the full loads, (n, 3) in mN."""
-        values = self.scene.resolve(theta)
-        force = self.dead.total(values)
-        if self.terms:
-            force = force - jax.grad(lambda v: sum(t.total(v, values) for t in self.terms))(u)
+        force = self.dead_force(theta) + force_on_body(self.terms, u, self.scene.resolve(theta))
         return force + self.follower_force(u, theta)
 
     def dead_force(self, theta: jax.Array) -> jax.Array:
@@ -171,51 +167,44 @@ class System:
         return self.dead.total(self.scene.resolve(theta))
 
     @compiled
-    def follower_force(self, u: jax.Array, theta: jax.Array) -> jax.Array | float:
+    def follower_force(self, u: jax.Array, theta: jax.Array) -> Number:
         """Return the force (n, 3) in mN of the loads without a potential; 0 when there are none."""
-        values = self.scene.resolve(theta)
-        return sum((force.total(u, values) for force in self.forces), 0.0)
+        return force_on_body(self.forces, u, self.scene.resolve(theta))
 
-    def springs_less_loads(
-        self, u: jax.Array, theta: jax.Array, load: jax.Array | float
-    ) -> jax.Array:
-        """Return the part (n, 3) of the residual in mN that is not the bulk's.
-
-        load : the load factor.
-        """
-        values = self.scene.resolve(theta)
-        springs = jax.grad(lambda w: sum((s.total(w, values) for s in self.springs), 0.0))(u)
-        return springs - load * self.external_force(u, theta)
+    def spring_force(self, u: jax.Array, theta: jax.Array) -> Number:
+        """Return the force (n, 3) in mN of the elastic supports on the body; 0 without any."""
+        return force_on_body(self.springs, u, self.scene.resolve(theta))
 
     @compiled
     def potential(
-        self,
-        u: jax.Array,
-        theta: jax.Array,
-        load: jax.Array | float = 1.0,
-        follower_force: jax.Array | float = 0.0,
+        self, u: jax.Array, theta: jax.Array, load: Number = 1.0, follower_force: Number = 0.0
     ) -> tuple[jax.Array, jax.Array]:
         """Return the potential energy at load factor ``load``, and the size of its parts, in mN mm.
 
         A load without a potential counts as the dead force ``follower_force`` (n, 3).
         """
-        internal = self.internal_energy(u, theta)
+        internal, values = self.internal_energy(u, theta), self.scene.resolve(theta)
         work = jnp.vdot(self.dead_force(theta), u)
         if self.forces:
             work = work + jnp.vdot(jnp.asarray(follower_force), u)
-        if self.terms:
-            values = self.scene.resolve(theta)
-            work = work - sum(term.total(u, values) for term in self.terms)
+        work = work - sum((term.total(u, values) for term in self.terms), 0.0)
         return internal - load * work, jnp.abs(internal) + jnp.abs(load * work)
 
-    def residual(self, u: jax.Array, theta: jax.Array, load: jax.Array | float = 1.0) -> jax.Array:
+    def residual(self, u: jax.Array, theta: jax.Array, load: Number = 1.0) -> jax.Array:
         """Return the residual (f,) in mN: internal less ``load`` times external force."""
         return self.restrict(self.internal_force(u, theta) - load * self.external_force(u, theta))
+
+    def residual_of(
+        self, forces: jax.Array, u: jax.Array, theta: jax.Array, load: Number
+    ) -> jax.Array:
+        """Return the residual (f,) in mN from the ``forces`` (b, a, 3) of the blocks."""
+        internal = self.scatter(forces) - self.spring_force(u, theta)
+        return self.restrict(internal - load * self.external_force(u, theta))
 
     # Balance
 
     @compiled
-    def balance(self, u: jax.Array, theta: jax.Array, load: jax.Array | float = 1.0) -> Balance:
+    def balance(self, u: jax.Array, theta: jax.Array, load: Number = 1.0) -> Balance:
         """Return the balance of ``u`` (n, 3) mm at load factor ``load``.
 
         The relative residual of a body without any forces is 0. NaN stays NaN.
@@ -223,13 +212,11 @@ class System:
         internal = self.internal_force(u, theta)
         external = load * self.external_force(u, theta)
         residual = self.restrict(internal - external)
-        size, norm = _norm(internal), _norm(residual)
-        scale = size + _norm(external)
+        size, norm = jnp.linalg.norm(internal), jnp.linalg.norm(residual)
+        scale = size + jnp.linalg.norm(external)
         return Balance(residual, size, norm / jnp.where(scale > 0.0, scale, 1.0))
 
-    def relative_residual(
-        self, u: jax.Array, theta: jax.Array, load: jax.Array | float = 1.0
-    ) -> jax.Array:
+    def relative_residual(self, u: jax.Array, theta: jax.Array, load: Number = 1.0) -> jax.Array:
         """Return the norm of the residual relative to the internal and external forces, ()."""
         return self.balance(u, theta, load).relative
 
@@ -242,14 +229,8 @@ class System:
         prescribed displacements.
         """
         residual, _, relative = self.balance(u, theta, load)
-        return residual, self._infinite_off_supports(u, theta, load, relative)
-
-    @compiled
-    def _infinite_off_supports(
-        self, u: jax.Array, theta: jax.Array, load: jax.Array, relative: jax.Array
-    ) -> jax.Array:
-        met = self.supports_met(u, theta, load)
-        return jnp.where(met & jnp.isfinite(relative), relative, jnp.inf)
+        admissible = self.supports_met(u, theta, load) & jnp.isfinite(relative)
+        return residual, jnp.where(admissible, relative, jnp.inf)
 
     # Tangent
 
@@ -259,112 +240,88 @@ class System:
 
         Of the upper triangle, where every load has a potential.
         """
-        local: list[LocalTerm | LocalForce] = [*self.springs, *self.terms, *self.forces]
-        bulk = upper_blocks(self.scene.blocks.connectivity)
-        groups = [bulk, *(whole_blocks(part.nodes) for part in local)]
-        return block_pattern(groups, self.free_index, symmetric=not self.forces)
-
-    @property
-    def free_index(self) -> np.ndarray:
-        """The position of each degree of freedom among the free ones; -1 where prescribed."""
+        entries = whole_blocks if self.inverse else upper_blocks
+        parts = (*self.springs, *self.terms, *self.forces)
+        groups = [entries(self.scene.blocks.connectivity), *(whole_blocks(p.nodes) for p in parts)]
+        # The position of each degree of freedom among the free ones; -1 where prescribed.
         index = np.full(self.scene.held.size, -1)
         index[self.free] = np.arange(len(self.free))
-        return index
+        return block_pattern(groups, index, symmetric=not (self.inverse or self.forces))
 
     def bulk(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the stiffness (b, pairs, 3, 3) of the blocks, mN/mm, as the pattern has them."""
-        scene = self.scene
-        H = seen_by_law(scene, displacement_gradient(scene, u))
-        law = stress_and_moduli(scene, theta)
-        stress, moduli = at_points(law, scene.block_tissue_at(theta), H)
+        scene, law = self.scene, stress_and_moduli(self.scene, theta)
+        stress, moduli = at_points(law, law_gradients(scene, u), scene.block_tissue_at(theta))
         return block_derivatives(scene, u, stress, moduli)[1]
 
-    def tangent(self, u: jax.Array, theta: jax.Array, load: jax.Array | float = 1.0) -> jax.Array:
+    def tangent(self, u: jax.Array, theta: jax.Array, load: Number = 1.0) -> jax.Array:
         """Return the nonzeros (nnz,) of the tangent over the free degrees of freedom, mN/mm."""
         return self.assemble(self.bulk(u, theta), u, theta, load, load)
 
     def assemble(
-        self,
-        bulk: jax.Array,
-        u: jax.Array,
-        theta: jax.Array,
-        load_stiffness: jax.Array | float,
-        load: jax.Array | float,
+        self, bulk: jax.Array, u: jax.Array, theta: jax.Array, load_stiffness: Number, load: Number
     ) -> jax.Array:
         """Return the nonzeros (nnz,) of the tangent, from the blocks, springs and loads.
 
-        Parameters
-        ----------
         bulk : the stiffness (b, pairs, 3, 3) of the blocks, mN/mm.
         load_stiffness : the factor of the loads' stiffness, 0 to leave it out.
         load : the load factor, which loads with convex potentials have in any case.
         """
-        values = self.scene.resolve(theta)
-        blocks = [bulk]
-        blocks += [spring.tangents(u, values) for spring in self.springs]
-        for term in self.terms:
-            blocks.append((load if term.convex else load_stiffness) * term.tangents(u, values))
-        blocks += [load_stiffness * force.tangents(u, values) for force in self.forces]
+        values, parts = self.scene.resolve(theta), self._factors(load_stiffness, load)
+        blocks = [bulk, *(factor * part.tangents(u, values) for part, factor in parts)]
         return self.pattern.sum(jnp.concatenate([block.reshape(-1) for block in blocks]))
 
-    def _force_of_tangent(
-        self,
-        u: jax.Array,
-        theta: jax.Array,
-        load_stiffness: jax.Array | float,
-        load: jax.Array | float,
-    ) -> jax.Array:
-        """Return the force (n, 3) in mN whose derivative :meth:`assemble` adds to the bulk's."""
-        force, values = self.springs_less_loads(u, theta, load_stiffness), self.scene.resolve(theta)
-        for term in (term for term in self.terms if term.convex):
-            force = force + (load - load_stiffness) * jax.grad(term.total)(u, values)
-        return force
+    def _factors(
+        self, load_stiffness: Number, load: Number
+    ) -> list[tuple[LocalTerm | LocalForce, Number]]:
+        """Return springs and loads that follow the deformation, with factors of their stiffness."""
+        springs = [(spring, 1.0) for spring in self.springs]
+        terms = [(term, load if term.convex else load_stiffness) for term in self.terms]
+        return [*springs, *terms, *((force, load_stiffness) for force in self.forces)]
 
     def equations(
-        self,
-        bulk: jax.Array,
-        u: jax.Array,
-        theta: jax.Array,
-        load_stiffness: jax.Array | float,
-        load: jax.Array | float,
+        self, bulk: jax.Array, u: jax.Array, theta: jax.Array, load_stiffness: Number, load: Number
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Return a tangent that solvers accept, whether it is the true one, and a force (f,) in mN.
 
         The force is the change of the residual, to first order, as the prescribed displacements go
         to their values at the load factor ``load``. The arguments are those of :meth:`assemble`.
         """
-        K, scene = self.assemble(bulk, u, theta, load_stiffness, load), self.scene
-        offset = self.support_offset(u, theta, load)
+        K = self.assemble(bulk, u, theta, load_stiffness, load)
+        safe, solvable = self.pattern.safe_values(K), self.pattern.solvable(K)
+        nothing = jnp.zeros(len(self.free))
+        if self.inverse:  # supports do not move
+            return safe, solvable, nothing
+        offset, values = self.support_offset(u, theta, load), self.scene.resolve(theta)
+
+        def of_parts(v: jax.Array) -> jax.Array:
+            parts = self._factors(load_stiffness, load)
+            forces = (factor * force_on_body((part,), v, values) for part, factor in parts)
+            return jnp.zeros_like(v) + sum(forces, 0.0)
 
         def force_of_offset() -> jax.Array:
-            force = self.scatter(pair_products(bulk, offset[scene.blocks.connectivity]))
-            rest = lambda v: self._force_of_tangent(v, theta, load_stiffness, load)  # noqa: E731
-            return self.restrict(force + jax.jvp(rest, (u,), (offset,))[1])
+            force = self.scatter(pair_products(bulk, offset[self.scene.blocks.connectivity]))
+            return self.restrict(force - jax.jvp(of_parts, (u,), (offset,))[1])
 
-        nothing = jnp.zeros(len(self.free))
         force = jax.lax.cond(jnp.any(offset != 0.0), force_of_offset, lambda: nothing)
-        return self.pattern.safe_values(K), self.pattern.solvable(K), force
+        return safe, solvable, force
 
     @compiled
     def step_equations(
-        self,
-        u: jax.Array,
-        theta: jax.Array,
-        load_stiffness: jax.Array | float,
-        load: jax.Array | float,
+        self, u: jax.Array, theta: jax.Array, load_stiffness: Number, load: Number
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Return :meth:`equations` with the stiffness of the strain energy."""
         return self.equations(self.bulk(u, theta), u, theta, load_stiffness, load)
 
     def safe_tangent(
-        self, u: jax.Array, theta: jax.Array, load: jax.Array | float = 1.0
+        self, u: jax.Array, theta: jax.Array, load: Number = 1.0
     ) -> tuple[jax.Array, jax.Array]:
         """Return a tangent (nnz,) that solvers accept, and whether it is the true one."""
         return self.step_equations(u, theta, load, load)[:2]
 
     # Prescribed displacements and admissible states
 
-    def support_offset(self, u: jax.Array, theta: jax.Array, load: jax.Array | float) -> jax.Array:
+    def support_offset(self, u: jax.Array, theta: jax.Array, load: Number) -> jax.Array:
         """Return the way (n, 3) in mm of the prescribed displacements to their values at ``load``.
 
         Fused multiply-add leaves the last bits of products in the difference; they count as none
@@ -398,17 +355,18 @@ class System:
         """Return the smallest ``J``, (): NaN if any is."""
         return jnp.min(volume_ratio(self.scene, u))
 
+    def keeps_volume(
+        self, u: jax.Array, step: jax.Array, share: float
+    ) -> Callable[[jax.Array], jax.Array]:
+        """Return whether a fraction of ``step`` leaves ``share`` of the smallest ``J`` at ``u``."""
+        floor = share * self.least_volume_ratio(u)
+        return lambda part: floor < self.least_volume_ratio(u + part * step)  # False for NaN
+
     # Linear systems
 
     def solve(self, tangent: jax.Array, rhs: jax.Array) -> jax.Array:
         """Return ``x`` (f,) with ``K x = rhs`` for any nonsingular K; NaN where K is singular."""
-        if self.direct.on_host:
-            return solve(self.direct, self.pattern, tangent, rhs)
-        return self._solve(tangent, rhs)
-
-    @compiled
-    def _solve(self, tangent: jax.Array, rhs: jax.Array) -> jax.Array:
-        return solve(self.direct, self.pattern, tangent, rhs)
+        return self._by_direct(solve)(tangent, rhs)
 
     def attempt(
         self, tangent: jax.Array, rhs: jax.Array, *, may_reuse: bool = True
@@ -421,13 +379,14 @@ class System:
         """
         if self.kept is not None and not is_traced(tangent, rhs):
             return self.kept.attempt(tangent, rhs, may_reuse=may_reuse)
-        if self.direct.on_host:
-            return attempt(self.direct, self.pattern, tangent, rhs)
-        return self._attempt(tangent, rhs)
+        return self._by_direct(attempt)(tangent, rhs)
 
-    @compiled
-    def _attempt(self, tangent: jax.Array, rhs: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return attempt(self.direct, self.pattern, tangent, rhs)
+    def _by_direct(self, how: Callable[..., Any]) -> Callable[..., Any]:
+        """Return ``how`` of the direct solver, compiled unless Python calls the solver."""
+        if how not in self.programs:
+            program = partial(how, self.direct, self.pattern)
+            self.programs[how] = program if self.direct.on_host else compiled(program)
+        return self.programs[how]
 
     @property
     def stepwise(self) -> bool:
@@ -442,7 +401,3 @@ class System:
         """The factor that serves several tangents; None where factorising is cheap."""
         pays = self.scene.dilatation == "pointwise" and KeptFactor.pays(self.pattern)
         return KeptFactor(self.direct, self.pattern) if pays else None
-
-
-def _norm(field: jax.Array) -> jax.Array:
-    return jnp.sqrt(jnp.sum(field**2))

@@ -28,6 +28,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+Number = jax.Array | float
+"""A number: an array (), or Python's."""
+
 
 def compiled[**P, R](function: Callable[P, R]) -> Callable[P, R]:
     """Compile ``function`` once for each shape of its arguments, as ``jax.jit`` does.
@@ -92,7 +95,9 @@ class _Program:
         if self.inside or any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
             return self.own(self.arrays, leaves)
         if self.shared is None:
-            text = self.own.lower(self.arrays, leaves).as_text()
+            # The text has no arrays that its results do not depend on: their types are added.
+            types = str([jax.typeof(array) for array in self.arrays])
+            text = types + self.own.lower(self.arrays, leaves).as_text()
             self.shared = PROGRAMS.same_as(text, self.own)
         return self.shared(self.arrays, leaves)
 

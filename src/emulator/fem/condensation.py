@@ -15,13 +15,15 @@ With :math:`g = E_{u\theta}`, :math:`b = V \bar J_u`, :math:`r_\theta = E_\theta
 :math:`r_p = V(\bar J - \theta)`, the two are eliminated block by block,
 
 .. math::
-    V \Delta\theta &= r_p + b^T \Delta u, \qquad
-    V \Delta p = r_\theta + g^T \Delta u + E_{\theta\theta}\, \Delta\theta \\
-    K_e &= E_{uu} + p V \bar J_{uu} + (g b^T + b g^T)/V + E_{\theta\theta}\, b b^T/V^2 \\
-    f_e &= E_u + p b + g\, r_p/V + b\,(r_\theta + E_{\theta\theta}\, r_p/V)/V .
+    V \Delta\theta &= s + C \cdot \Delta u, \qquad
+    \Delta p = q + Q \cdot \Delta u + h\, \Delta\theta \\
+    K_e &= f_u + f_\theta \otimes C/V + f_p \otimes (Q + h\, C/V), \qquad
+    f_e = f + f_\theta\, s/V + f_p\, (q + h\, s/V)
 
-Where :math:`\theta = \bar J(u)` and :math:`p = E_\theta/V` these are the force and the tangent of
-the energy in u alone, so both formulations have the same solutions.
+with the force :math:`f = L_u`, :math:`f_\theta = g`, :math:`f_p = C = b`, :math:`s = r_p`,
+:math:`q = r_\theta/V`, :math:`Q = g/V` and :math:`h = E_{\theta\theta}/V`. Where
+:math:`\theta = \bar J(u)` and :math:`p = E_\theta/V` these are the force and the tangent of the
+energy in u alone, so both formulations have the same solutions.
 
 With :math:`\hat H(H, \theta)` the gradient that the law sees, and :math:`\hat P` and
 :math:`\hat A` the law's stress and moduli there,
@@ -49,7 +51,6 @@ from emulator.fem.energy import (
 from emulator.fem.material_point import stress_and_moduli
 from emulator.mechanics.kinematics import Strain
 from emulator.scenes.scene import Scene
-from emulator.scenes.tissue import Tissue
 
 
 class Volumes(NamedTuple):
@@ -63,53 +64,68 @@ class Volumes(NamedTuple):
     pressure: jax.Array
 
 
-class Couplings(NamedTuple):
-    """The coefficients that eliminate the volumes and pressures, as in the module docstring.
-
-    b, g : the couplings (b, a, 3) with the displacement.
-    r_change, r_pressure : the residuals (b,) of volumes and pressures.
-    stiffness : the second derivative (b,) of the energy in the volumes.
-    """
-
-    b: jax.Array
-    g: jax.Array
-    r_change: jax.Array
-    r_pressure: jax.Array
-    stiffness: jax.Array
-
-
-class Condensed(NamedTuple):
-    """The linearisation with the volumes eliminated.
-
-    force : the nodal forces of the blocks, (b, a, 3) mN.
-    tangent : the stiffness of the blocks, (b, pairs, 3, 3) mN/mm.
-    couplings : the coefficients of the elimination.
-    """
-
-    force: jax.Array
-    tangent: jax.Array
-    couplings: Couplings
-
-
-class _Residuals(NamedTuple):
-    """The derivatives of ``L`` in u (b, a, 3), in the volumes (b,), and in the pressures (b,)."""
+class Residuals(NamedTuple):
+    """The force f (b, a, 3) in mN, s (b,) in mm3 and q (b,) in kPa of the module docstring."""
 
     force: jax.Array
     change: jax.Array
     pressure: jax.Array
 
 
+class Couplings(NamedTuple):
+    """The coefficients that eliminate the volumes and pressures, as in the module docstring.
+
+    residuals : the residuals of the iterate.
+    V : the volumes, (b,) mm3.
+    C, Q : the derivatives (b, a, 3) of s and q in the displacement.
+    h : the derivative (b,) of q in the volume ratio, kPa.
+    onto_change, onto_pressure : the derivatives (b, a, 3) of the force in either.
+    """
+
+    residuals: Residuals
+    V: jax.Array
+    C: jax.Array
+    Q: jax.Array
+    h: jax.Array
+    onto_change: jax.Array
+    onto_pressure: jax.Array
+
+    def eliminated(self, at: Residuals) -> jax.Array:
+        """Return ``f_e`` (b, a, 3) for the residuals of this iterate or of another.
+
+        Those of another and the tangent of this one give the simplified Newton step.
+        """
+        change = at.change / self.V
+        pressure = at.pressure + self.h * change
+        force = at.force + change[:, None, None] * self.onto_change
+        return force + pressure[:, None, None] * self.onto_pressure
+
+    def advance(self, volumes: Volumes, step: jax.Array, fraction: jax.Array) -> Volumes:
+        """Return ``volumes`` after ``fraction`` of the blocks' full ``step`` (b, a, 3) mm."""
+        along_C, along_Q = (jnp.einsum("bai,bai->b", slope, step) for slope in (self.C, self.Q))
+        change = (self.residuals.change + along_C) / self.V
+        pressure = self.residuals.pressure + along_Q + self.h * change
+        return Volumes(volumes.change + fraction * change, volumes.pressure + fraction * pressure)
+
+
+class Condensed(NamedTuple):
+    """The linearisation of the blocks, volumes eliminated where they share one.
+
+    force : the nodal forces of the blocks, (b, a, 3) mN.
+    tangent : the stiffness of the blocks in mN/mm, as the pattern of the equations has it.
+    couplings : the coefficients of the elimination; None without shared volumes.
+    """
+
+    force: jax.Array
+    tangent: jax.Array
+    couplings: Couplings | None = None
+
+
 def block_derivatives(
-    scene: Scene,
-    u: jax.Array,
-    stress: jax.Array,
-    moduli: jax.Array,
-    known: jax.Array | None = None,
+    scene: Scene, u: jax.Array, stress: jax.Array, moduli: jax.Array, known: jax.Array | None = None
 ) -> tuple[jax.Array, jax.Array]:
     """Return the forces (b, a, 3) in mN and tangents (b, pairs, 3, 3) in mN/mm of the blocks.
 
-    Parameters
-    ----------
     scene : the scene.
     u : the displacement, (n, 3) mm.
     stress, moduli : the first (b, q, 3, 3) and second (b, q, 3, 3, 3, 3) derivatives of the energy
@@ -118,12 +134,13 @@ def block_derivatives(
     """
     if scene.dilatation == "pointwise":
         return nodal_vectors(scene.blocks, stress), pair_matrices(scene.blocks, moduli)
-    H, V = block_gradients(scene, u), _volume(scene)
+    H = block_gradients(scene, u)
     change = _mean_change(scene, H)
 
     def condensed(stress: jax.Array) -> Condensed:
-        slope = _at_points(_first, H, change, stress)[1]
-        volumes = Volumes(change, block_integral(scene, slope) / V)
+        slope = lambda *x: jax.vjp(with_volume_change, *x[:2])[1](x[2])[1]  # noqa: E731
+        slopes = at_points(slope, H, per_point(H, change), stress)
+        volumes = Volumes(change, block_integral(scene, slopes) / block_volume(scene))
         return _condensed(scene, H, volumes, stress, moduli)
 
     linearised = condensed(stress)
@@ -135,65 +152,41 @@ def consistent(scene: Scene, u: jax.Array, theta: jax.Array) -> Volumes:
     H = block_gradients(scene, u)
     change = _mean_change(scene, H)
     slope = _slopes(scene, H, change, theta)[1]
-    return Volumes(change, block_integral(scene, slope) / _volume(scene))
+    return Volumes(change, block_integral(scene, slope) / block_volume(scene))
 
 
 def linearise(scene: Scene, u: jax.Array, volumes: Volumes, theta: jax.Array) -> Condensed:
     """Return the force and tangent of every block at ``u`` (n, 3) mm and ``volumes``."""
     H, law = block_gradients(scene, u), stress_and_moduli(scene, theta)
     response = lambda H, change, at: law(with_volume_change(H, change), at)  # noqa: E731
-    stress, moduli = at_points(
-        response, scene.block_tissue_at(theta), H, per_point(H, volumes.change)
-    )
-    return _condensed(scene, H, volumes, stress, moduli)
+    change, tissue = per_point(H, volumes.change), scene.block_tissue_at(theta)
+    return _condensed(scene, H, volumes, *at_points(response, H, change, tissue))
 
 
-def eliminated_force(
-    scene: Scene, u: jax.Array, volumes: Volumes, theta: jax.Array, couplings: Couplings
-) -> jax.Array:
-    """Return the force (b, a, 3) of every block at ``u``, eliminated with earlier ``couplings``.
-
-    It is the force of :func:`linearise`, but with the couplings of an earlier iterate: solving with
-    that iterate's tangent gives the simplified Newton step.
-    """
+def residuals(scene: Scene, u: jax.Array, volumes: Volumes, theta: jax.Array) -> Residuals:
+    """Return the residuals of every block at ``u`` (n, 3) mm and ``volumes``."""
     H = block_gradients(scene, u)
-    P, slope = _slopes(scene, H, volumes.change, theta)
-    return _eliminated(scene, _residuals(scene, H, volumes, P, slope), couplings)
-
-
-def advance(
-    scene: Scene, volumes: Volumes, couplings: Couplings, step: jax.Array, fraction: jax.Array
-) -> Volumes:
-    """Return ``volumes`` after ``fraction`` of the full ``step`` (n, 3) mm."""
-    local = step[scene.blocks.connectivity]
-    at, V = couplings, _volume(scene)
-    change = (at.r_pressure + jnp.einsum("mai,mai->m", at.b, local)) / V
-    pressure = at.r_change + jnp.einsum("mai,mai->m", at.g, local) + at.stiffness * change
-    return Volumes(volumes.change + fraction * change, volumes.pressure + fraction * pressure / V)
+    return _residuals(scene, H, volumes, *_slopes(scene, H, volumes.change, theta))
 
 
 def _condensed(
     scene: Scene, H: jax.Array, volumes: Volumes, stress: jax.Array, moduli: jax.Array
 ) -> Condensed:
     """Return the linearisation, from the law's derivatives in the gradients that it sees."""
-    grid, V = scene.blocks, _volume(scene)
-    P, slope, A, coupling, curvature = _at_points(_second, H, volumes.change, stress, moduli)
+    grid, V = scene.blocks, block_volume(scene)
+    change = per_point(H, volumes.change)
+    P, slope, A, coupling, curvature = at_points(_second, H, change, stress, moduli)
     r = _residuals(scene, H, volumes, P, slope)
     p = volumes.pressure[:, None, None, None, None, None]
-    A = A + p * _over_points(jax.hessian(volume_change), H)
-    b = nodal_vectors(grid, _over_points(jax.grad(volume_change), H))
-    g, stiffness = nodal_vectors(grid, coupling), block_integral(scene, curvature)
-    # g b^T + b g^T + stiffness b b^T / V for each pair of nodes, as a half and its transpose.
-    half = (g + 0.5 * (stiffness / V)[:, None, None] * b) / V[:, None, None]
+    A = A + p * at_points(jax.hessian(volume_change), H)
+    b = nodal_vectors(grid, at_points(jax.grad(volume_change), H))
+    g, h = nodal_vectors(grid, coupling), block_integral(scene, curvature) / V
+    # g b^T/V + b g^T/V + h b b^T/V for each pair of nodes, as a half and its transpose.
+    half = (g + 0.5 * h[:, None, None] * b) / V[:, None, None]
     one, other = np.triu_indices(b.shape[1])
     outer = half[:, one, :, None] * b[:, other, None, :] + b[:, one, :, None] * half[:, other, None]
-    couplings = Couplings(b, g, r.change, r.pressure, stiffness)
-    return Condensed(_eliminated(scene, r, couplings), pair_matrices(grid, A) + outer, couplings)
-
-
-def _first(H: jax.Array, change: jax.Array, stress: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the derivatives in ``H`` (3, 3) and ``change`` () of an energy with ``stress``."""
-    return jax.vjp(with_volume_change, H, change)[1](stress)
+    couplings = Couplings(r, V, b, g / V[:, None, None], h, g, b)
+    return Condensed(couplings.eliminated(r), pair_matrices(grid, A) + outer, couplings)
 
 
 def _second(
@@ -222,44 +215,25 @@ def _slopes(
     energy = point_energy(scene, theta)
     density = lambda H, change, at: energy(with_volume_change(H, change), at)  # noqa: E731
     tissue = scene.block_tissue_at(theta)
-    return at_points(jax.grad(density, (0, 1)), tissue, H, per_point(H, change))
+    return at_points(jax.grad(density, (0, 1)), H, per_point(H, change), tissue)
 
 
 def _residuals(
     scene: Scene, H: jax.Array, volumes: Volumes, P: jax.Array, slope: jax.Array
-) -> _Residuals:
-    """Return the derivatives of ``L`` from the density's, in ``H`` and in the volumes."""
-    V, p = _volume(scene), volumes.pressure
-    change, cofactor = _over_points(jax.value_and_grad(volume_change), H)
-    return _Residuals(
+) -> Residuals:
+    """Return the residuals from the density's derivatives in ``H`` and in the volumes."""
+    V, p = block_volume(scene), volumes.pressure
+    change, cofactor = at_points(jax.value_and_grad(volume_change), H)
+    return Residuals(
         nodal_vectors(scene.blocks, P + p[:, None, None, None] * cofactor),
-        block_integral(scene, slope) - p * V,
         block_integral(scene, change) - V * volumes.change,
-    )
-
-
-def _eliminated(scene: Scene, r: _Residuals, couplings: Couplings) -> jax.Array:
-    """Return ``f_e`` (b, a, 3) of the module docstring."""
-    V, stiffness = _volume(scene), couplings.stiffness
-    along_g, along_b = r.pressure / V, (r.change + stiffness * r.pressure / V) / V
-    return r.force + along_g[:, None, None] * couplings.g + along_b[:, None, None] * couplings.b
-
-
-def _at_points(function, H: jax.Array, change: jax.Array, *fields: jax.Array):  # noqa: ANN001, ANN202
-    """Return ``function`` of each point, with the ``change`` (b,) of its block."""
-    return at_points(
-        lambda *point: function(*point[:-1]), Tissue(), H, per_point(H, change), *fields
+        block_integral(scene, slope) / V - p,
     )
 
 
 def per_point(H: jax.Array, change: jax.Array) -> jax.Array:
     """Return ``change`` (b,) of the blocks at each of their points, (b, q)."""
     return jnp.broadcast_to(change[:, None], H.shape[:2])
-
-
-def _over_points(function, H: jax.Array):  # noqa: ANN001, ANN202
-    """Return ``function`` of each displacement gradient of ``H`` (b, q, 3, 3)."""
-    return jax.vmap(jax.vmap(function))(H)
 
 
 def volume_change(H: jax.Array) -> jax.Array:
@@ -269,7 +243,7 @@ def volume_change(H: jax.Array) -> jax.Array:
 
 def _mean_change(scene: Scene, H: jax.Array) -> jax.Array:
     """Return the mean ``J - 1`` (b,) of each block."""
-    return block_integral(scene, _over_points(volume_change, H)) / _volume(scene)
+    return block_integral(scene, at_points(volume_change, H)) / block_volume(scene)
 
 
 def block_integral(scene: Scene, density: jax.Array) -> jax.Array:
@@ -277,8 +251,8 @@ def block_integral(scene: Scene, density: jax.Array) -> jax.Array:
     return jnp.sum(scene.blocks.weights * density, axis=1)
 
 
-def _volume(scene: Scene) -> jax.Array:
-    """Return the volume (b,) of each block at rest, mm3."""
+def block_volume(scene: Scene) -> jax.Array:
+    """Return the volume (b,) of each block of the mesh, mm3."""
     return jnp.sum(jnp.asarray(scene.blocks.weights), axis=1)
 
 

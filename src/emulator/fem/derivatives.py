@@ -26,12 +26,16 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import zero_from_primal
 
+from emulator.core.errors import SolverError
 from emulator.fem.assembly import System
 from emulator.fem.compiled import compiled, is_traced, one_by_one
 from emulator.fem.fallbacks import find_equilibrium
 from emulator.fem.newton import NewtonOptions
 from emulator.fem.solution import Solution
+from emulator.scenes.scene import Scene
 
 RootFinder = Callable[[System, NewtonOptions, jax.Array, jax.Array], Solution]
 """The solution of a system's equations, from its options, theta (p,) and a start (n, 3) mm."""
@@ -57,6 +61,12 @@ class Equations(NamedTuple):
     residual: Callable[..., jax.Array]
 
 
+def equations_of(system: System, u: jax.Array, theta: jax.Array) -> Equations:
+    """Return the equations of ``system`` with the root ``u`` (n, 3) mm at ``theta`` (p,)."""
+    tangent = system.safe_tangent(u, theta)[0]
+    return Equations(system, u, tangent, lambda theta, u: system.residual(u, theta))
+
+
 def differentiable(
     system: System, options: NewtonOptions, find: RootFinder = find_equilibrium
 ) -> SolutionMap:
@@ -65,8 +75,6 @@ def differentiable(
     The function works in Python and under ``jit``, ``vmap`` (one theta after the other) and
     ``grad``.
 
-    Parameters
-    ----------
     system : the equations.
     options : the controls of Newton's method.
     find : the function that finds their root.
@@ -78,8 +86,8 @@ def differentiable(
         return (program if is_traced(theta, start) else by_steps)(theta, start)
 
     def derivative(u: jax.Array, theta: jax.Array, direction: jax.Array) -> jax.Array:
-        tangent = system.safe_tangent(u, theta, 1.0)[0]
-        return _directional_derivative(system, tangent, u, theta, direction)
+        tangent = system.safe_tangent(u, theta)[0]
+        return derivatives_along(system, tangent, u, theta, direction[None])[0]
 
     return implicit(stepwise if system.stepwise else program, derivative)
 
@@ -98,26 +106,33 @@ def implicit(
     def rule(primals, tangents):  # noqa: ANN001, ANN202
         solution = solution_at(*primals)
         du = derivative(solution.displacement, *primals[:-1], *tangents[:-1])
-        return solution, _zero_tangents(solution)._replace(displacement=du)
+        return solution, zero_from_primal(solution)._replace(displacement=du)
 
     return solution_at
 
 
 @compiled
-def _directional_derivative(
-    system: System, tangent: jax.Array, u: jax.Array, theta: jax.Array, direction: jax.Array
+def derivatives_along(
+    system: System, tangent: jax.Array, u: jax.Array, theta: jax.Array, directions: jax.Array
 ) -> jax.Array:
-    """Return the derivative (n, 3) of the equilibrium ``u`` along ``direction`` (p,) in theta."""
-    _, (force, prescribed) = jax.jvp(system.residual_on_supports(u), (theta,), (direction,))
-    return prescribed + system.extend(-system.solve(tangent, force))
+    """Return the derivatives (k, n, 3) of the equilibrium ``u`` along ``directions`` (k, p)."""
+    equations = system.residual_on_supports(u)
+    along = jax.vmap(lambda direction: jax.jvp(equations, (theta,), (direction,))[1])
+    forces, prescribed = along(directions)
+    return jax.vmap(system.extend, 1)(-system.solve(tangent, forces.T)) + prescribed
 
 
-@compiled
-def sensitivities(system: System, tangent: jax.Array, u: jax.Array, theta: jax.Array) -> jax.Array:
+def sensitivities(system: System, u: jax.Array, theta: jax.Array) -> jax.Array:
     """Return the derivatives (p, n, 3) of the equilibrium ``u`` in each entry of theta."""
-    forces, prescribed = jax.jacfwd(system.residual_on_supports(u))(theta)
-    free = jax.vmap(system.extend, in_axes=1)(-system.solve(tangent, forces))
-    return free + jnp.moveaxis(prescribed, -1, 0)
+    tangent = system.safe_tangent(u, theta)[0]
+    return derivatives_along(system, tangent, u, theta, jnp.eye(len(theta)))
+
+
+def require_finite(scene: Scene, derivatives: jax.Array, what: str) -> jax.Array:
+    """Return ``derivatives``, or raise :class:`SolverError` where they are not finite numbers."""
+    if not is_traced(derivatives) and not np.isfinite(derivatives).all():
+        raise SolverError(f"scene '{scene.name}': {what} has no derivatives: singular tangent")
+    return derivatives
 
 
 def adjoint(
@@ -135,15 +150,3 @@ def adjoint(
         return value, by_theta + pull_back((-multiplier, by_u))[0]
 
     return value_and_gradient
-
-
-def _zero_tangents(solution: Solution) -> Solution:
-    """Return the zero tangents of a solution: float0 for its integers."""
-    return jax.tree.map(
-        lambda x: (
-            jnp.zeros_like(x)
-            if jnp.issubdtype(x.dtype, jnp.floating)
-            else jnp.zeros(x.shape, dtype=jax.dtypes.float0)
-        ),
-        solution,
-    )

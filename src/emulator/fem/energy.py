@@ -21,7 +21,7 @@ element, or a patch.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,6 +48,12 @@ def require_rest(scene: Scene) -> None:
         )
 
 
+def require_shape(scene: Scene, name: str, array: jax.Array, shape: tuple[int, ...]) -> None:
+    """Raise :class:`InputError` unless ``array`` has the ``shape``."""
+    if array.shape != shape:
+        raise InputError(f"scene '{scene.name}': {name} has shape {array.shape}; expected {shape}")
+
+
 def displacement_gradient(scene: Scene, u: jax.Array) -> jax.Array:
     """Return ``H = du/dX`` at every quadrature point, (m, q, 3, 3), from ``u`` (n, 3) in mm."""
     local = u[scene.discretisation.connectivity]
@@ -57,8 +63,7 @@ def displacement_gradient(scene: Scene, u: jax.Array) -> jax.Array:
 def volume_ratio(scene: Scene, u: jax.Array) -> jax.Array:
     """Return ``J = det F`` at every quadrature point, (m, q); J <= 0 is an inverted element."""
     H = displacement_gradient(scene, u)
-    F = H + jnp.eye(3, dtype=H.dtype)
-    return jax.vmap(determinant)(F.reshape(-1, 3, 3)).reshape(F.shape[:2])
+    return at_points(determinant, H + jnp.eye(3, dtype=H.dtype))
 
 
 def parameters_at(scene: Scene, theta: jax.Array) -> Callable[[Tissue], list[jax.Array]]:
@@ -89,16 +94,15 @@ def point_energy(scene: Scene, theta: jax.Array, barriers: Barriers | None = Non
     return energy
 
 
-def at_points(function: Callable, tissue: Tissue, *fields: jax.Array) -> Any:
-    """Return ``function(*point, tissue)`` at every point of ``fields`` (m, q, ...).
+def at_points(function: Callable, H: jax.Array, *fields: Any) -> Any:
+    """Return ``function(*point)`` at every point of ``H`` (m, q, 3, 3) and of more ``fields``.
 
-    Leaves of the result are (m, q, ...). All points are one batch: a ``vmap`` in a ``vmap`` takes
-    half as long again to trace.
+    Fields are trees of arrays (m, q, ...), as the result is. All points are one batch: a ``vmap``
+    in a ``vmap`` takes half as long again to trace.
     """
-    shape = fields[0].shape[:2]
-    points = jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:]), (*fields, tissue))
+    points = jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:]), (H, *fields))
     values = jax.vmap(function)(*points)
-    return jax.tree.map(lambda array: array.reshape(*shape, *array.shape[1:]), values)
+    return jax.tree.map(lambda array: array.reshape(*H.shape[:2], *array.shape[1:]), values)
 
 
 def with_volume_change(
@@ -169,11 +173,9 @@ def pair_products(pairs: jax.Array, local: jax.Array) -> jax.Array:
 
 def strain_energy(scene: Scene, barriers: Barriers | None = None) -> Energy:
     """Return ``(u, theta) -> int W dX`` in mN mm."""
-
-    def energy(u: jax.Array, theta: jax.Array) -> jax.Array:
-        return energy_of_gradient(scene, displacement_gradient(scene, u), theta, barriers)
-
-    return energy
+    return lambda u, theta: energy_of_gradient(
+        scene, displacement_gradient(scene, u), theta, barriers
+    )
 
 
 def energy_of_gradient(
@@ -181,13 +183,16 @@ def energy_of_gradient(
 ) -> jax.Array:
     """Return ``int W dX`` in mN mm from the displacement gradient ``H`` (m, q, 3, 3)."""
     density = point_energy(scene, theta, barriers)
-    law_gradients = seen_by_law(scene, H, barriers)
-    values = at_points(density, scene.block_tissue_at(theta), law_gradients)
+    values = at_points(density, _seen_by_law(scene, H, barriers), scene.block_tissue_at(theta))
     return jnp.sum(scene.blocks.weights * values)
 
 
-def seen_by_law(scene: Scene, H: jax.Array, barriers: Barriers | None = None) -> jax.Array:
-    """Return the displacement gradients (b, q, 3, 3) that the law sees, from ``H`` (m, q, 3, 3)."""
+def law_gradients(scene: Scene, u: jax.Array) -> jax.Array:
+    """Return the displacement gradients (b, q, 3, 3) that the law sees at ``u`` (n, 3) mm."""
+    return _seen_by_law(scene, displacement_gradient(scene, u))
+
+
+def _seen_by_law(scene: Scene, H: jax.Array, barriers: Barriers | None = None) -> jax.Array:
     H = scene.blocks.gather(H)
     if scene.dilatation == "pointwise":
         return H
@@ -213,6 +218,17 @@ def local_forces(scene: Scene) -> list[LocalForce]:
     return [force for force in forces if force is not None]
 
 
+def force_on_body(
+    parts: Iterable[LocalTerm | LocalForce], u: jax.Array, values: Values
+) -> jax.Array | float:
+    """Return the nodal force (n, 3) in mN of potentials and forces; 0 where there are none."""
+    forces = (
+        -jax.grad(part.total)(u, values) if isinstance(part, LocalTerm) else part.total(u, values)
+        for part in parts
+    )
+    return sum(forces, 0.0)
+
+
 @dataclass(frozen=True, eq=False)
 class DeadForce:
     """The nodal force of the dead loads, which do not follow the deformation.
@@ -226,20 +242,16 @@ class DeadForce:
 
     def total(self, values: Values) -> jax.Array:
         """Return the force (n, 3) in mN at the scene's parameter ``values``."""
-        return sum(
-            (values[name] * force for name, force in self.per_unit.items()),
-            jnp.asarray(self.constant),
-        )
+        scaled = (values[name] * force for name, force in self.per_unit.items())
+        return sum(scaled, jnp.asarray(self.constant))
 
 
-def dead_force(scene: Scene) -> DeadForce | None:
-    """Return the force of the dead loads; ``None`` when there are none."""
+def dead_force(scene: Scene) -> DeadForce:
+    """Return the force of the dead loads; zero when there are none."""
     forces: dict[str | None, np.ndarray] = {}
     for load in scene.loads:
         for name, force in load.dead_forces(scene.discretisation).items():
             forces[name] = forces.get(name, 0.0) + force
-    if not forces:
-        return None
     constant = forces.pop(None, np.zeros(scene.held.shape))
     return DeadForce(constant, {str(name): force for name, force in forces.items()})
 
@@ -271,11 +283,10 @@ def potential_energy(scene: Scene, barriers: Barriers | None = None) -> Energy:
 
     def energy(u: jax.Array, theta: jax.Array) -> jax.Array:
         total = internal(u, theta)
-        if dead is not None:
+        if dead.per_unit or dead.constant.any():
             total = total - jnp.vdot(dead.total(scene.resolve(theta)), u)
-        if springs or terms:
-            values = scene.resolve(theta)
-            total = total + sum(term.total(u, values) for term in springs + terms)
+        for term in springs + terms:
+            total = total + term.total(u, scene.resolve(theta))
         return total
 
     return energy

@@ -5,7 +5,7 @@ A body with several equilibria has one that loading leads to from rest. These st
 
 1. From the caller's start, at the full load: stress iterates while the relative residual exceeds
    5 %, then Newton's method.
-2. From rest, stress iterates (:mod:`emulator.fem.formulations.stress_iterates`) up a schedule of
+2. From rest, stress iterates (:mod:`emulator.fem.stress_iterates`) up a schedule of
    load factors, then Newton's method from where they lead. There are four schedules, of ever
    smaller increments.
 3. From rest, Newton's method, load level by load level (:mod:`emulator.fem.load_stepping`).
@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,11 +32,10 @@ import numpy as np
 from emulator.fem.assembly import System
 from emulator.fem.compiled import cond, while_loop
 from emulator.fem.formulations.displacement import UNBALANCED
-from emulator.fem.formulations.stress_iterates import StressIterates, StressState, applies
 from emulator.fem.load_stepping import LoadStepping
 from emulator.fem.newton import NEAR, NewtonOptions
-from emulator.fem.solution import Solution, Status
-from emulator.fem.state import NewtonState
+from emulator.fem.solution import NewtonState, Solution, Status
+from emulator.fem.stress_iterates import StressIterates, StressState, applies
 
 
 class Strategy(NamedTuple):
@@ -95,16 +94,11 @@ _SHORT = 15  # largest number of Newton iterations, except in the last strategy
 
 def strategies(system: System, options: NewtonOptions) -> tuple[Strategy, ...]:
     """Return the strategies for a scene, in the order in which they are tried."""
-    if not _iterates_stresses(system, options):
+    if not options.stress_iterates or options.increment != 1.0 or not applies(system.scene):
         return FROM_START, Strategy(newton_load=options.increment)
     moving = system.scene.prescribed.moves
     schedules = SCHEDULES[:_SCHEDULES_OF_MOVING_SUPPORTS] if moving else SCHEDULES
     return FROM_START, *schedules, LOAD_LEVELS
-
-
-def _iterates_stresses(system: System, options: NewtonOptions) -> bool:
-    whole_load = options.increment == 1.0
-    return options.stress_iterates and whole_load and applies(system.scene)
 
 
 class SearchState(NamedTuple):
@@ -169,10 +163,12 @@ class EquilibriumSearch:
 
     def begin(self, newton: NewtonState) -> SearchState:
         """Return the first state, from Newton's at the caller's start: there or at rest."""
-        schedules = self._has_schedules
         # Load increments of the caller's choice are followed from rest.
-        usable = _is_usable(newton, schedules=schedules) & (self.options.increment == 1.0)
-        stress = self._stress_iterates(jnp.ones(())).begin(newton.u) if schedules else None
+        usable = jnp.any(newton.u != 0.0) & (self.options.increment == 1.0)
+        stress = None
+        if self._has_schedules:
+            usable &= newton.relative_residual <= _FARTHEST
+            stress = self._stress_iterates(jnp.ones(())).begin(newton.u)
         begins = ~usable & newton.running
         far = newton.relative_residual > NEAR
         count = jnp.zeros((), dtype=int)
@@ -181,7 +177,7 @@ class EquilibriumSearch:
             stress=stress,
             strategy=jnp.where(usable, np.int64(0), np.int64(1)),
             begins=begins,
-            by_stress=(begins | far) & newton.running & schedules,
+            by_stress=(begins | far) & newton.running & self._has_schedules,
             load=jnp.ones(()),
             steps=count,
             level_steps=count,
@@ -193,73 +189,59 @@ class EquilibriumSearch:
 
         def proceed(state: SearchState) -> SearchState:
             if not self._has_schedules:
-                return self.newton_step(state)
-            return cond(state.by_stress, self.stress_step, self.newton_step, state)
+                return self._newton_step(state)
+            return cond(state.by_stress, self._stress_step, self._newton_step, state)
 
         return cond(state.begins, self._begin_strategy, proceed, state)
 
-    def stress_step(self, state: SearchState) -> SearchState:
+    def _begin_strategy(self, state: SearchState) -> SearchState:
+        """Return the state at the beginning of its strategy; iterations are counted on."""
+        before, strategy, stress = state.newton, _strategy(self.strategies, state.strategy), None
+        newton = self.load_stepping.begin(before.u, before.round_off)
+        if self._has_schedules:
+            stress = self._stress_iterates(strategy.first_load).begin(before.u)
+        history = newton.history._replace(
+            increment=strategy.newton_load, largest_indefinite=strategy.largest_indefinite
+        )
+        by_stress = state.by_stress & newton.running & (strategy.most_steps > 0)
+        return state._replace(
+            newton=newton._replace(
+                load=strategy.newton_load,
+                history=history,
+                iterations=before.iterations,
+                factorisations=before.factorisations,
+            ),
+            stress=stress,
+            begins=jnp.array(False),
+            by_stress=by_stress & self._has_schedules,
+            load=strategy.first_load,
+            steps=jnp.zeros((), dtype=int),
+            level_steps=jnp.zeros((), dtype=int),
+        )
+
+    def _stress_step(self, state: SearchState) -> SearchState:
         """Return the state after one step of the stress iterates."""
         assert state.stress is not None
-        load_stiffness, geometric = _stiffness_factors(
-            state.load, state.strategy, state.steps, state.newton.relative_residual
-        )
+        # No loads are balanced in the first step from rest, and a start far from balance has rough
+        # stresses: either stiffness would make the tangent indefinite.
+        unbalanced = state.newton.relative_residual > UNBALANCED
+        first = (state.steps == 0) & ((state.strategy != 0) | unbalanced)
+        factors = jnp.where(first, 0.0, state.load), jnp.where(first, 0.0, 1.0)
         # Strategy 0 ends at an indefinite tangent; later ones solve again without extra stiffness.
-        stress = self._stress_iterates(state.load).step(
-            state.stress, load_stiffness, geometric, state.strategy != 0
-        )
+        iterates = self._stress_iterates(state.load)
+        stress = iterates.step(state.stress, *factors, state.strategy != 0)
         return _after_stress_step(state, stress, table=self.strategies)
 
-    def newton_step(self, state: SearchState) -> SearchState:
+    def _newton_step(self, state: SearchState) -> SearchState:
         """Return the state after one iteration of Newton's method."""
         last = len(self.strategies) - 1
         newton = self.load_stepping.step(state.newton, state.strategy == last)
-        return _after_newton_step(
-            state._replace(newton=newton), last=last, schedules=self._has_schedules
-        )
-
-    def _begin_strategy(self, state: SearchState) -> SearchState:
-        """Return the state at the beginning of its strategy; iterations are counted on."""
-        before, load, stress = state.newton, jnp.ones(()), None
-        newton = self.load_stepping.begin(before.u, before.round_off)
-        if self._has_schedules:
-            load = _first_load(state.strategy, table=self.strategies)
-            stress = self._stress_iterates(load).begin(before.u)
-        newton = newton._replace(iterations=before.iterations, factorisations=before.factorisations)
-        return _begun(
-            newton, stress, state.strategy, state.by_stress, load, state.stress_steps,
-            table=self.strategies,
-        )  # fmt: skip
+        return _after_newton_step(state, newton, last=last, schedules=self._has_schedules)
 
 
-def _column(table: tuple[Strategy, ...], name: str) -> jax.Array:
-    """Return one number of all strategies, as an array."""
-    return jnp.array([getattr(strategy, name) for strategy in table])
-
-
-@partial(jax.jit, static_argnames="schedules")
-def _is_usable(newton: NewtonState, *, schedules: bool) -> jax.Array:
-    """Return whether the caller's start is worth trying."""
-    deformed = jnp.any(newton.u != 0.0)
-    return deformed & (newton.relative_residual <= _FARTHEST) if schedules else deformed
-
-
-@partial(jax.jit, static_argnames="table")
-def _first_load(strategy: jax.Array, *, table: tuple[Strategy, ...]) -> jax.Array:
-    return _column(table, "first_load")[strategy]
-
-
-@jax.jit
-def _stiffness_factors(
-    load: jax.Array, strategy: jax.Array, steps: jax.Array, relative_residual: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Return the factors of the load stiffness and of the geometric stiffness of a stress step.
-
-    Both are 0 in the first step from rest, where nothing balances the loads, and from a start far
-    from balance, whose rough stresses would make the tangent indefinite.
-    """
-    first = (steps == 0) & ((strategy != 0) | (relative_residual > UNBALANCED))
-    return jnp.where(first, 0.0, load), jnp.where(first, 0.0, 1.0)
+def _strategy(table: tuple[Strategy, ...], number: jax.Array) -> Any:
+    """Return one strategy, its numbers as arrays ()."""
+    return Strategy._make(jnp.array(column)[number] for column in zip(*table, strict=True))
 
 
 @partial(jax.jit, static_argnames="table")
@@ -267,8 +249,16 @@ def _after_stress_step(
     state: SearchState, stress: StressState, *, table: tuple[Strategy, ...]
 ) -> SearchState:
     """Return the state after a step of the stress iterates: next load, Newton, or fallback."""
-    load, failed, ends = _judge_schedule(state, stress, table)
-    newton = state.newton
+    newton, strategy = state.newton, _strategy(table, state.strategy)
+    valid = (stress.fraction > 0.0) & jnp.isfinite(stress.error) & stress.definite
+    valid &= (stress.refused < _TOO_STEEP) | ~strategy.steep
+    balanced = valid & (state.load == 1.0) & (stress.error <= NEAR)
+    exhausted = (state.steps + 1 >= strategy.most_steps) | (state.level_steps + 1 >= _MOST_AT_LEVEL)
+    failed = ~valid | (~balanced & exhausted)
+    ends = failed | balanced
+    easy = (stress.error < _EASY) & (state.steps > 1) & strategy.steep
+    higher = state.load + jnp.where(easy, 2.0, 1.0) * strategy.load_increment
+    load = jnp.where(stress.error < _BALANCED, jnp.minimum(1.0, higher), state.load)
     return state._replace(
         newton=newton._replace(u=jnp.where(ends, jnp.where(failed, 0.0, stress.u), newton.u)),
         stress=stress,
@@ -282,75 +272,24 @@ def _after_stress_step(
     )
 
 
-def _judge_schedule(
-    state: SearchState, stress: StressState, table: tuple[Strategy, ...]
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return the next load factor, whether the schedule has failed, and whether it ends."""
-    increment = _column(table, "load_increment")[state.strategy]
-    most_steps = _column(table, "most_steps")[state.strategy]
-    steep = _column(table, "steep")[state.strategy]
-    valid = (stress.fraction > 0.0) & jnp.isfinite(stress.error) & stress.definite
-    valid &= (stress.refused < _TOO_STEEP) | ~steep
-    balanced = valid & (state.load == 1.0) & (stress.error <= NEAR)
-    exhausted = (state.steps + 1 >= most_steps) | (state.level_steps + 1 >= _MOST_AT_LEVEL)
-    easy = (stress.error < _EASY) & (state.steps > 1) & steep
-    higher = jnp.minimum(1.0, state.load + jnp.where(easy, 2.0, 1.0) * increment)
-    load = jnp.where(stress.error < _BALANCED, higher, state.load)
-    failed = ~valid | (~balanced & exhausted)
-    return load, failed, failed | balanced
-
-
 @partial(jax.jit, static_argnames=("last", "schedules"))
-def _after_newton_step(state: SearchState, *, last: int, schedules: bool) -> SearchState:
-    """Return the state, or the beginning of the next strategy where Newton's method has failed."""
-    newton = state.newton
-    fails = _newton_fails(newton) & (state.strategy < last)
+def _after_newton_step(
+    state: SearchState, newton: NewtonState, *, last: int, schedules: bool
+) -> SearchState:
+    """Return the state, or the beginning of the next strategy where Newton's method has failed.
+
+    It has, where it is not short and monotone at the full load: a level that failed is followed by
+    a lower one.
+    """
+    running, history = newton.running, newton.history
+    ended = (newton.status == Status.CONVERGED) | (newton.status == Status.ITERATION_LIMIT)
+    failed = (~running & ~ended) | ~history.monotone | (newton.load < 1.0)
+    fails = (failed | (running & (history.iterations >= _SHORT))) & (state.strategy < last)
     return state._replace(
         newton=newton._replace(u=jnp.where(fails, 0.0, newton.u)),
         strategy=jnp.where(fails, state.strategy + 1, state.strategy),
         begins=fails,
         by_stress=fails & schedules,
-    )
-
-
-def _newton_fails(newton: NewtonState) -> jax.Array:
-    """Return whether Newton's method is not short and monotone at the full load.
-
-    A level that failed is followed by a lower one.
-    """
-    running, history = newton.running, newton.history
-    ended = (newton.status == Status.CONVERGED) | (newton.status == Status.ITERATION_LIMIT)
-    failed = (~running & ~ended) | ~history.monotone | (newton.load < 1.0)
-    return failed | (running & (history.iterations >= _SHORT))
-
-
-@partial(jax.jit, static_argnames="table")
-def _begun(
-    newton: NewtonState,
-    stress: StressState | None,
-    strategy: jax.Array,
-    by_stress: jax.Array | bool,
-    load: jax.Array,
-    stress_steps: jax.Array,
-    *,
-    table: tuple[Strategy, ...],
-) -> SearchState:
-    """Return the state at the beginning of ``strategy``."""
-    newton_load = _column(table, "newton_load")[strategy]
-    largest_indefinite = _column(table, "largest_indefinite")[strategy]
-    history = newton.history._replace(increment=newton_load, largest_indefinite=largest_indefinite)
-    has_schedule = _column(table, "most_steps")[strategy] > 0
-    count = jnp.zeros((), dtype=int)
-    return SearchState(
-        newton=newton._replace(load=newton_load, history=history),
-        stress=stress,
-        strategy=strategy,
-        begins=jnp.array(False),
-        by_stress=by_stress & newton.running & has_schedule & (stress is not None),
-        load=load,
-        steps=count,
-        level_steps=count,
-        stress_steps=stress_steps,
     )
 
 

@@ -14,12 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.fem.energy import (
-    at_points,
-    displacement_gradient,
-    energy_of_gradient,
-    point_energy,
-)
+from emulator.fem.energy import at_points, displacement_gradient, energy_of_gradient
 from emulator.geometry.fibres import unit
 from emulator.mechanics.kinematics import determinant
 
@@ -44,11 +39,11 @@ def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np
     """
     H = displacement_gradient(scene, jnp.asarray(u))
     F = H + jnp.eye(3, dtype=H.dtype)
-    J = jax.vmap(jax.vmap(determinant))(F)
+    J = at_points(determinant, F)
     P = _first_piola(scene, H, theta)
     if scene.fibres is not None:
-        values, directions = scene.resolve(theta), scene.fibres_at(theta)
-        active = (load.first_piola(F, scene.mesh, directions, values) for load in scene.loads)
+        values, fibres = scene.resolve(theta), scene.fibres_at(theta)
+        active = (load.first_piola(F, scene.mesh, fibres, values) for load in scene.loads)
         P = sum((stress for stress in active if stress is not None), P)
     # Round-off leaves sigma slightly asymmetric; eigenvalue routines need it symmetric.
     sigma = _symmetric(P @ jnp.swapaxes(F, -1, -2)) / J[..., None, None]
@@ -61,7 +56,6 @@ def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np
 
     fields = {"J": mean(J), "cauchy_stress": mean(sigma), "green_lagrange": mean(E)}
     if scene.fibres is not None:
-        fibres = scene.fibres_at(theta)
         along = jnp.einsum("mqij,mqj->mqi", F, fibres)
         fields["fibres"], fields["deformed_fibres"] = unit(mean(fibres)), unit(mean(along))
         fields["fibre_stretch"] = mean(jnp.linalg.norm(along, axis=-1))
@@ -72,8 +66,6 @@ def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np
 
 def _first_piola(scene: Scene, H: jax.Array, theta: jax.Array) -> jax.Array:
     """Return the first Piola-Kirchhoff stress (m, q, 3, 3) in kPa of the strain energy."""
-    if scene.dilatation == "pointwise":
-        return at_points(jax.grad(point_energy(scene, theta)), scene.tissue_at(theta), H)
     slope = jax.grad(energy_of_gradient, argnums=1)(scene, H, theta)
     return slope / scene.discretisation.weights[..., None, None]
 

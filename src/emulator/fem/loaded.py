@@ -19,7 +19,6 @@ The mesh x + w is a new one for every theta; one program loads all of them
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
@@ -36,7 +35,7 @@ from emulator.fem.fallbacks import find_equilibrium
 from emulator.fem.linear import Outcome
 from emulator.fem.newton import NewtonOptions
 from emulator.fem.solution import Solution
-from emulator.fem.unloading import Unloaded, Unloader, system_at_rest
+from emulator.fem.unloading import Unloaded, Unloader, system_at_rest, unchecked
 from emulator.scenes.scene import Scene
 
 _RECENT = 16  # stress-free shapes kept for derivatives after a solve
@@ -57,8 +56,11 @@ class LoadedEquilibrium:
 
     @cached_property
     def _on_mesh(self) -> Scene:
-        """The scene as if its mesh were at rest."""
-        return _without_image(self.scene)
+        """The scene as if its mesh were at rest.
+
+        A parameter that only the image has is then nobody's, which a new scene would refuse.
+        """
+        return unchecked(self.scene, loaded_by=MappingProxyType({}))
 
     @cached_property
     def unloader(self) -> Unloader:
@@ -111,73 +113,62 @@ class LoadedEquilibrium:
         image_slopes = jax.jacfwd(partial(image_theta, self.scene))(theta)
         by_image = self.unloader.sensitivities(unloaded, image)
         w, w_slopes = unloaded.displacement, jnp.tensordot(image_slopes.T, by_image, 1)
-        return self._total_derivatives(theta, w, v - w, w_slopes)
+        each = jnp.eye(len(theta))
+        return w_slopes + _derivatives_along(self.system, v - w, theta, w, each, w_slopes)
 
     def equations(self, v: jax.Array, theta: jax.Array) -> tuple[Equations, ...]:
         """Return the equations of w and of u, at ``v`` (n, 3) mm from the mesh."""
-        image = partial(image_theta, self.scene)
+        image, system = partial(image_theta, self.scene), self.system
         w = self.unloaded(theta).displacement
         (unloading,) = self.unloader.equations(w, image(theta))
         residual = unloading.residual
-        tangent = self._tangent(theta, w, v - w)
         return (
             unloading._replace(residual=lambda theta, w: residual(image(theta), w)),
-            Equations(self.system, v - w, tangent, lambda t, w, u: self._residual(u, t, w)),
+            Equations(
+                system,
+                v - w,
+                _tangent(system, v - w, theta, w),
+                lambda theta, w, u: system_at_rest(system, w, theta).residual(u, theta),
+            ),
         )
 
     def is_stable(self, v: jax.Array, theta: jax.Array) -> bool:
         """Return whether ``v`` (n, 3) mm from the mesh is a minimum of the energy."""
         w = self.unloaded(theta).displacement
-        K, zero = self._tangent(theta, w, v - w), jnp.zeros(len(self.system.free))
+        K, zero = _tangent(self.system, v - w, theta, w), jnp.zeros(len(self.system.free))
         return int(self.system.attempt(K, zero)[1]) == Outcome.OK
-
-    def _residual(self, u: jax.Array, theta: jax.Array, w: jax.Array) -> jax.Array:
-        return system_at_rest(self.system, w, theta).residual(u, theta)
-
-    @cached_property
-    def _tangent(self) -> Callable[[jax.Array, jax.Array, jax.Array], jax.Array]:
-        """``(theta, w, u) -> nonzeros (nnz,)`` of the tangent."""
-
-        @compiled
-        def tangent(theta: jax.Array, w: jax.Array, u: jax.Array) -> jax.Array:
-            return system_at_rest(self.system, w, theta).safe_tangent(u, theta)[0]
-
-        return tangent
 
     @cached_property
     def _load(self) -> Callable[[jax.Array, jax.Array, jax.Array], Solution]:
         """``(theta, w, start) -> Solution`` on the mesh x + w, differentiable in theta and w."""
-        system, residual = self.system, self._residual
+        system = self.system
 
         def find(theta: jax.Array, w: jax.Array, start: jax.Array) -> Solution:
             return find_equilibrium(system_at_rest(system, w, theta), self.options, theta, start)
 
-        @compiled
         def derivative(
             u: jax.Array, theta: jax.Array, w: jax.Array, *directions: jax.Array
         ) -> jax.Array:
-            force = jax.jvp(partial(residual, u), (theta, w), directions)[1]
-            tangent = system_at_rest(system, w, theta).safe_tangent(u, theta)[0]
-            return system.extend(-system.solve(tangent, force))
+            return _derivatives_along(system, u, theta, w, *(d[None] for d in directions))[0]
 
         return implicit(compiled(one_by_one(find)), derivative)
 
-    @cached_property
-    def _total_derivatives(
-        self,
-    ) -> Callable[[jax.Array, jax.Array, jax.Array, jax.Array], jax.Array]:
-        """``(theta, w, u, dw/dtheta) -> dv/dtheta``, derivatives (p, n, 3)."""
-        system, residual = self.system, self._residual
 
-        @compiled
-        def total(theta: jax.Array, w: jax.Array, u: jax.Array, w_slopes: jax.Array) -> jax.Array:
-            forces = jax.vmap(
-                lambda *directions: jax.jvp(partial(residual, u), (theta, w), directions)[1]
-            )(jnp.eye(len(theta)), w_slopes)
-            tangent = system_at_rest(system, w, theta).safe_tangent(u, theta)[0]
-            return w_slopes + jax.vmap(system.extend, 1)(-system.solve(tangent, forces.T))
+@compiled
+def _tangent(system: System, u: jax.Array, theta: jax.Array, w: jax.Array) -> jax.Array:
+    """Return the nonzeros (nnz,) of the tangent at ``u`` (n, 3) mm from the mesh x + w."""
+    return system_at_rest(system, w, theta).safe_tangent(u, theta)[0]
 
-        return total
+
+@compiled
+def _derivatives_along(
+    system: System, u: jax.Array, theta: jax.Array, w: jax.Array, *directions: jax.Array
+) -> jax.Array:
+    """Return the derivatives (k, n, 3) of ``u`` along directions (k, p) in theta and in w."""
+    residual = lambda theta, w: system_at_rest(system, w, theta).residual(u, theta)  # noqa: E731
+    forces = jax.vmap(lambda *along: jax.jvp(residual, (theta, w), along)[1])(*directions)
+    solution = -system.solve(_tangent(system, u, theta, w), forces.T)
+    return jax.vmap(system.extend, 1)(solution)
 
 
 def image_theta(scene: Scene, theta: jax.Array) -> jax.Array:
@@ -186,13 +177,3 @@ def image_theta(scene: Scene, theta: jax.Array) -> jax.Array:
     for load, image in scene.loaded_by.items():
         theta = theta.at[scene.parameter_names.index(load)].set(values[image])
     return theta
-
-
-def _without_image(scene: Scene) -> Scene:
-    """Return the scene without ``loaded_by``, unchecked, because theta stays.
-
-    A parameter that only the image had is then nobody's, which a new scene would refuse.
-    """
-    plain = copy.copy(scene)
-    object.__setattr__(plain, "loaded_by", MappingProxyType({}))
-    return plain

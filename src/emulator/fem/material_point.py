@@ -64,8 +64,6 @@ class MaterialPoint:
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Return stress P (3, 3), moduli (3, 3, 3, 3) and known stress (3, 3) in kPa.
 
-        Parameters
-        ----------
         H : the displacement gradient, (3, 3).
         own : the measures (k,) that the point's stresses belong to.
         at : the tissue.

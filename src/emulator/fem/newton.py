@@ -7,10 +7,19 @@ r"""One iteration of Newton's method at a fixed load factor: direction, then ste
 at load factor s, where the loads are :math:`s f` and the prescribed displacements :math:`s \bar u`.
 Where the tangent is indefinite and the direction raises the potential, the opposite one is taken.
 The step is taken whole where the residual alone shows that it is good, and otherwise by a line
-search on the potential energy (:mod:`emulator.fem.line_search`). An accepted fraction is halved
-again while that lowers the potential further: a soft start overshoots, and from there the tangent
-is indefinite and the way back long. Loads without a potential keep their present force while a step
-is judged.
+search (:func:`backtrack`) for the largest fraction :math:`\alpha \in \{1, \tfrac12, \tfrac14,
+\dots\}` that keeps every element's :math:`J` above a fraction of its present least value and lowers
+the potential energy by Armijo's rule,
+
+.. math::
+    \Pi(u + \alpha \Delta u) \le \Pi(u) + 10^{-4}\, \alpha\, r \cdot \Delta u .
+
+Exponential laws diverge without it (docs/experiments.md, "Newton's steps: guard J only, or ask for
+descent"). An accepted fraction is halved again while that lowers the potential further: a soft
+start overshoots, and from there the tangent is indefinite and the way back long. Loads without a
+potential keep their present force while a step is judged. Loops carry their decisions as state, so
+that conditions read a flag: under ``vmap`` a condition that evaluates the potential itself never
+returned on a ventricle.
 
 Two measures save factorisations, which are most of the cost. The tangent of the last iteration is
 kept while a step with it cuts the residual at least tenfold. And while the loads are hardly
@@ -33,9 +42,8 @@ from emulator.core.errors import InputError
 from emulator.fem.assembly import System
 from emulator.fem.compiled import compiled, cond, while_loop
 from emulator.fem.formulations import Linearised, formulation_of
-from emulator.fem.line_search import ARMIJO, Progress, armijo, backtrack
 from emulator.fem.linear import Outcome
-from emulator.fem.state import NewtonState
+from emulator.fem.solution import NewtonState
 
 # Relative residual below which the residual alone judges a step, and Newton's method takes over
 # from the stress iterates (docs/experiments.md, "Stresses as iterates").
@@ -47,6 +55,8 @@ _LEAST_MONOTONE = 2.0**-6
 # Least fraction that is halved because the potential falls further; below, the search has found a
 # valley (docs/experiments.md, "Fewer factorisations from rest").
 _SMALLEST_HALVED = 0.02
+ARMIJO = 1e-4  # textbook value; the energy rarely comes close to this bound
+_ROUND_OFF = 1e-13  # relative to the energy's parts; smaller decreases are round-off
 _SINGULAR = 1e13  # ratio of step to force over stiffness from which the tangent is singular
 
 
@@ -71,7 +81,7 @@ class NewtonOptions:
     keep_tangent : the fraction of the residual below which a step's tangent is used again; 0 is the
         full Newton method (docs/experiments.md, "Fewer factorisations from rest").
     stress_iterates : whether to begin, far from equilibrium, with
-        :mod:`emulator.fem.formulations.stress_iterates` where the scene allows it (see ``applies``
+        :mod:`emulator.fem.stress_iterates` where the scene allows it (see ``applies``
         there); never with load increments (docs/experiments.md, "Stresses as iterates: the
         ventricle from rest in five factorisations").
     """
@@ -141,20 +151,10 @@ class Step(NamedTuple):
     inverting: jax.Array
 
 
-class _Descent(NamedTuple):
-    """A fraction, its potential, and whether half of it may be lower."""
-
-    fraction: jax.Array
-    energy: jax.Array
-    falls: jax.Array
-
-
-class _TrialStep(NamedTuple):
-    """A trial step, whether the line search has been used, and whether the trials end."""
-
-    step: Step
-    searched: jax.Array
-    ends: jax.Array
+_TrialStep = tuple[Step, jax.Array, jax.Array]
+"""A trial step, whether the line search has been used, and whether the trials end."""
+_Descent = tuple[jax.Array, jax.Array, jax.Array]
+"""A fraction of a step, its potential, and whether half of it may be lower."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,14 +181,9 @@ class Newton:
         again = indefinite & allow_indefinite
         full = cond(again, lambda: system.solve(equations.tangent, -force), lambda: full)
         saddle = state.auxiliary is not None
+        bare, reversible = equations._replace(couplings=None), on_supports & (not saddle)
         step, slope, singular = _full_step(
-            system,
-            state.u,
-            theta,
-            state.load,
-            equations._replace(couplings=None),
-            on_supports & (not saddle),
-            full,
+            system, state.u, theta, state.load, bare, reversible, full
         )
         return Direction(
             step,
@@ -206,14 +201,13 @@ class Newton:
 
         A kept tangent is worth a full step or none: its direction is not searched along.
         """
-        system, theta, initial_residual = self.system, self.theta, state.relative_residual
-        none = Step(state.u, state.residual, initial_residual, jnp.zeros(()), jnp.array(False))
-        in_newton_range = (
-            _is_near(direction.on_supports, initial_residual) & state.displacement_only
-        )
+        system, theta, before = self.system, self.theta, state.relative_residual
+        none = Step(state.u, state.residual, before, jnp.zeros(()), jnp.array(False))
+        near = direction.on_supports & (before < NEAR) & state.displacement_only
 
         def attempt(trial: _TrialStep) -> _TrialStep:
-            searches = trial.searched | ~in_newton_range
+            _, searched, _ = trial
+            searches = searched | ~near
             fraction, inverting = cond(
                 searches,
                 lambda: self._search(state, direction),
@@ -222,29 +216,23 @@ class Newton:
             u = _advance(system, state.u, theta, direction.step, fraction, state.load)
             residual, relative = system.admissible_balance(u, theta, state.load)
             J, J_before = system.least_volume_ratio(u), system.least_volume_ratio(state.u)
-            good = searches | _is_good(relative, initial_residual, J, self.options.shrink, J_before)
+            good = searches | ((relative <= 0.5 * before) & (self.options.shrink * J_before < J))
             step = Step(u, residual, relative, fraction, inverting)
             step = jax.tree.map(lambda yes, no: jnp.where(good, yes, no), step, none)
-            return _TrialStep(step, jnp.array(True), good | ~state.renew)
+            return step, jnp.array(True), good | ~state.renew
 
-        first = _TrialStep(none, jnp.array(False), ~in_newton_range & ~state.renew)
-        return while_loop(lambda trial: ~trial.ends, attempt, first).step
+        first = none, jnp.array(False), ~near & ~state.renew
+        return while_loop(lambda trial: ~trial[2], attempt, first)[0]
 
     def _search(self, state: NewtonState, direction: Direction) -> tuple[jax.Array, jax.Array]:
         """Return the fraction of the step to take, and whether inverting elements forbade twice it.
 
         The fraction is 0 where none makes progress.
         """
-        system, u, step = self.system, state.u, direction.step
-        test = formulation_of(system).monotonicity_test(
-            state, self.theta, direction.equations, step
-        )
-        floor = self.options.shrink * system.least_volume_ratio(u)
-        follower = system.follower_force(u, self.theta)
-
-        def admissible(fraction: jax.Array) -> jax.Array:
-            return floor < system.least_volume_ratio(u + fraction * step)  # False for NaN
-
+        system, theta, u, step = self.system, self.theta, state.u, direction.step
+        equations, on_supports = direction.equations, direction.on_supports
+        test = formulation_of(system).monotonicity_test(state, theta, equations, step)
+        admissible = system.keeps_volume(u, step, self.options.shrink)
         if test is not None:
             # Round-off cannot be distinguished from progress, so it passes the test.
             unclear = state.relative_residual <= self.options.round_off
@@ -252,36 +240,36 @@ class Newton:
                 admissible, lambda f: (unclear | test(f), jnp.zeros(())), _LEAST_MONOTONE
             )
             return jnp.where(trial.accepted, trial.fraction, 0.0), trial.inverting
+        follower = system.follower_force(u, theta)
 
         def potential(fraction: jax.Array) -> tuple[jax.Array, jax.Array]:
-            return system.potential(u + fraction * step, self.theta, state.load, follower)
+            return system.potential(u + fraction * step, theta, state.load, follower)
 
-        progress = self._progress(state, direction, potential)
-        trial = backtrack(admissible, progress, _LEAST_FRACTION)
-        first = _Descent(trial.fraction, trial.energy, direction.on_supports & trial.accepted)
-        fraction = _lowest(lambda f: potential(f)[0], first)
-        return jnp.where(trial.accepted, fraction, 0.0), trial.inverting
-
-    def _progress(
-        self,
-        state: NewtonState,
-        direction: Direction,
-        potential: Callable[[jax.Array], tuple[jax.Array, jax.Array]],
-    ) -> Progress:
-        """Return Armijo's rule, or a smaller residual where loads have no potential."""
-        descent = jnp.where(direction.on_supports, -ARMIJO * jnp.abs(direction.slope), jnp.inf)
-        falls = armijo(potential, descent)
+        falls = armijo(
+            potential, jnp.where(on_supports, -ARMIJO * jnp.abs(direction.slope), jnp.inf)
+        )
 
         def progress(fraction: jax.Array) -> tuple[jax.Array, jax.Array]:
+            """Return Armijo's rule, or a smaller residual where loads have no potential."""
             lower, energy = falls(fraction)
-            if self.system.forces:
-                u = state.u + fraction * direction.step
-                residual = self.system.balance(u, self.theta, state.load).residual
-                squared_norm = jnp.sum(direction.equations.residual**2)
+            if system.forces:
+                residual = system.balance(u + fraction * step, theta, state.load).residual
+                squared_norm = jnp.sum(equations.residual**2)
                 lower |= jnp.sum(residual**2) < (1.0 - ARMIJO * fraction) * squared_norm
             return lower, energy
 
-        return progress
+        trial = backtrack(admissible, progress, _LEAST_FRACTION)
+
+        def halve(at: _Descent) -> _Descent:
+            fraction, least, _ = at
+            energy = potential(0.5 * fraction)[0]
+            lower = energy < least
+            fraction = jnp.where(lower, 0.5 * fraction, fraction)
+            return fraction, jnp.where(lower, energy, least), lower
+
+        first = trial.fraction, trial.energy, on_supports & trial.accepted
+        fraction = while_loop(lambda at: at[2] & (at[0] > _SMALLEST_HALVED), halve, first)[0]
+        return jnp.where(trial.accepted, fraction, 0.0), trial.inverting
 
 
 @compiled
@@ -301,50 +289,13 @@ def _full_step(
     """
     force = equations.residual + equations.offset_force
     slope = jnp.vdot(equations.residual, step)
-    singular = _is_singular(equations.tangent, step, force)
+    # A step so long for its force can only come of a singular tangent.
+    size = jnp.max(jnp.abs(equations.tangent)) * jnp.max(jnp.abs(step))
+    singular = ~(size <= _SINGULAR * jnp.max(jnp.abs(force)))
     step = jnp.where(reversible & (slope > 0.0), -step, step)
     step = system.extend(step) + system.support_offset(u, theta, load)
     solvable = equations.solvable
     return jnp.where(solvable, step, jnp.nan), slope, ~solvable | singular
-
-
-def _is_singular(tangent: jax.Array, step: jax.Array, force: jax.Array) -> jax.Array:
-    """Return whether a step is so long for its force that the tangent must be singular."""
-    size = jnp.max(jnp.abs(tangent)) * jnp.max(jnp.abs(step))
-    return ~(size <= _SINGULAR * jnp.max(jnp.abs(force)))
-
-
-@jax.jit
-def _is_near(on_supports: jax.Array, relative_residual: jax.Array) -> jax.Array:
-    return on_supports & (relative_residual < NEAR)
-
-
-@jax.jit
-def _is_good(
-    relative: jax.Array,
-    initial_residual: jax.Array,
-    J: jax.Array,
-    shrink: float,
-    J_before: jax.Array,
-) -> jax.Array:
-    """Return whether a step halves the residual and inverts no element."""
-    return (relative <= 0.5 * initial_residual) & (shrink * J_before < J)
-
-
-def _lowest(potential: Callable[[jax.Array], jax.Array], first: _Descent) -> jax.Array:
-    """Halve the fraction as long as that lowers the potential."""
-
-    def halve(at: _Descent) -> _Descent:
-        half = 0.5 * at.fraction
-        energy = potential(half)
-        lower = energy < at.energy
-        fraction = jnp.where(lower, half, at.fraction)
-        return _Descent(fraction, jnp.where(lower, energy, at.energy), lower)
-
-    def proceeds(at: _Descent) -> jax.Array:
-        return at.falls & (at.fraction > _SMALLEST_HALVED)
-
-    return while_loop(proceeds, halve, first).fraction
 
 
 @compiled
@@ -360,3 +311,65 @@ def _advance(
     u = jnp.where(fraction > 0.0, u + fraction * step, u)
     # A full step meets the prescribed displacements; setting them avoids the last bit of round-off.
     return jnp.where(fraction == 1.0, system.scene.on_supports(u, theta, level=load), u)
+
+
+Admissible = Callable[[jax.Array], jax.Array]
+"""Whether no element is near inversion after a fraction of the step."""
+Progress = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
+"""Whether a fraction of the step makes progress, and the potential there, mN mm."""
+
+
+class Trial(NamedTuple):
+    """A fraction of a step.
+
+    fraction : the fraction of the full step, ().
+    energy : the potential there, () in mN mm.
+    accepted : whether the fraction is admissible and makes progress.
+    admissible : whether no element is near inversion.
+    inverting : whether twice the fraction was not admissible.
+    """
+
+    fraction: jax.Array
+    energy: jax.Array
+    accepted: jax.Array
+    admissible: jax.Array
+    inverting: jax.Array
+
+
+def backtrack(admissible: Admissible, progress: Progress, least: float) -> Trial:
+    """Halve the step until it is admissible and makes progress, or would go below ``least``."""
+
+    def halve(trial: Trial) -> Trial:
+        fraction = 0.5 * trial.fraction
+        is_admissible, (lower, energy) = admissible(fraction), progress(fraction)
+        return Trial(fraction, energy, is_admissible & lower, is_admissible, ~trial.admissible)
+
+    def proceeds(trial: Trial) -> jax.Array:
+        return ~trial.accepted & (trial.fraction >= 2.0 * least)
+
+    no = jnp.array(False)
+    twice = Trial(jnp.full((), 2.0), jnp.zeros(()), accepted=no, admissible=~no, inverting=no)
+    return while_loop(proceeds, halve, twice)
+
+
+def largest_admissible(admissible: Admissible, least: float) -> jax.Array:
+    """Return the largest of 1, 1/2, 1/4, ... that is admissible; 0 if it is below ``least``."""
+    trial = backtrack(admissible, lambda _: (jnp.array(True), jnp.zeros(())), least)
+    return jnp.where(trial.accepted, trial.fraction, 0.0)
+
+
+def armijo(
+    potential: Callable[[jax.Array], tuple[jax.Array, jax.Array]], descent: jax.Array
+) -> Progress:
+    """Return whether the potential falls by a part of the full step's ``descent``, mN mm.
+
+    potential : the potential after a fraction of the step, and the size of its parts.
+    """
+    energy, size = potential(jnp.zeros(()))
+    ceiling = energy + _ROUND_OFF * size
+
+    def progress(fraction: jax.Array) -> tuple[jax.Array, jax.Array]:
+        trial_energy = potential(fraction)[0]
+        return trial_energy <= ceiling + fraction * descent, trial_energy
+
+    return progress

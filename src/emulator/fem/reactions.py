@@ -36,8 +36,10 @@ from emulator.core.errors import InputError
 from emulator.fem.assembly import System
 from emulator.fem.compiled import compiled
 from emulator.fem.energy import (
+    DeadForce,
     at_points,
     dead_force,
+    force_on_body,
     local_forces,
     local_terms,
     point_energy,
@@ -45,9 +47,8 @@ from emulator.fem.energy import (
     strain_energy,
     with_mean_dilatation,
 )
-from emulator.geometry.discretisation import Blocks
 from emulator.geometry.mesh import Mesh
-from emulator.scenes.part import LocalForce, LocalTerm, Values
+from emulator.scenes.part import LocalForce, LocalTerm
 from emulator.scenes.scene import Scene
 
 
@@ -67,10 +68,8 @@ def reactions(system: System, u: jax.Array, theta: jax.Array) -> jax.Array:
     theta : the parameters, (p,).
     """
     bulk = jax.grad(strain_energy(system.scene))(u, theta)
-    values = system.scene.resolve(theta)
-    springs = jax.grad(lambda v: sum((s.total(v, values) for s in system.springs), 0.0))(u)
-    prescribed = jnp.asarray(system.scene.held)
-    return jnp.where(prescribed, bulk - system.external_force(u, theta), -springs)
+    at_prescribed = bulk - system.external_force(u, theta)
+    return jnp.where(system.scene.held, at_prescribed, system.spring_force(u, theta))
 
 
 def nodes_of(mesh: Mesh, name: str) -> np.ndarray:
@@ -141,118 +140,76 @@ class SupportForce:
     @cached_property
     def _virtual(self) -> tuple[np.ndarray, np.ndarray]:
         """The virtual displacement (n, 3) at prescribed displacements, and at springs."""
-        at = nodes_of(self.scene.mesh, self.name)
-        virtual = np.zeros(self.scene.held.shape)
-        virtual[at] = self.direction
-        sprung = np.zeros(len(virtual), dtype=bool)
+        held, virtual = self.scene.held, np.zeros(self.scene.held.shape)
+        virtual[nodes_of(self.scene.mesh, self.name)] = self.direction
+        sprung = np.zeros((len(virtual), 1), dtype=bool)
         for spring in spring_terms(self.scene):
             sprung[spring.nodes] = True
-        prescribed = self.scene.held
-        return np.where(prescribed, virtual, 0.0), np.where(
-            sprung[:, None] & ~prescribed, virtual, 0.0
-        )
+        return np.where(held, virtual, 0.0), np.where(sprung & ~held, virtual, 0.0)
 
     @cached_property
     def _adjacent(self) -> np.ndarray:
         """The blocks that have a prescribed node of the support."""
-        return np.flatnonzero(
-            self._moves(self._virtual[0])[self._balanced.blocks.connectivity].any(1)
-        )
+        at_support = self._virtual[0].any(axis=1)
+        return np.flatnonzero(at_support[self._balanced.blocks.connectivity].any(axis=1))
 
     @cached_property
-    def _bulk(self) -> Blocks:
-        blocks = self._balanced.blocks
-        connectivity = self._renumbered[blocks.connectivity[self._adjacent]]
-        return Blocks(
-            connectivity, blocks.gradients[self._adjacent], blocks.weights[self._adjacent]
-        )
-
-    @cached_property
-    def _parts(self) -> tuple[list[LocalTerm], list[LocalForce], list[LocalTerm]]:
-        """Potentials and forces of loads where prescribed, potentials of springs where free."""
-        prescribed, sprung = self._virtual
-        scene = self._balanced
-        terms = _contributions_at(local_terms(scene), self._moves(prescribed))
-        forces = _contributions_at(local_forces(scene), self._moves(prescribed))
-        return terms, forces, _contributions_at(spring_terms(scene), self._moves(sprung))
-
-    @staticmethod
-    def _moves(virtual: np.ndarray) -> np.ndarray:
-        return virtual.any(axis=1)
+    def _parts(self) -> tuple[list[LocalTerm | LocalForce], list[LocalTerm]]:
+        """Loads that follow the deformation where prescribed, and springs where free."""
+        scene, (prescribed, sprung) = self._balanced, self._virtual
+        loads: list[LocalTerm | LocalForce] = [*local_terms(scene), *local_forces(scene)]
+        return _contributions_at(loads, prescribed), _contributions_at(spring_terms(scene), sprung)
 
     @cached_property
     def nodes(self) -> np.ndarray:
         """The nodes (k,) whose displacement the force depends on."""
         parts = [part.nodes.ravel() for group in self._parts for part in group]
-        return np.unique(
-            np.concatenate([self._balanced.blocks.connectivity[self._adjacent].ravel(), *parts])
-        )
+        blocks = self._balanced.blocks.connectivity[self._adjacent].ravel()
+        return np.unique(np.concatenate([blocks, *parts]))
 
     @cached_property
-    def _renumbered(self) -> np.ndarray:
-        position = np.full(len(self.scene.mesh.nodes), -1)
-        position[self.nodes] = np.arange(len(self.nodes))
-        return position
+    def _dead(self) -> DeadForce:
+        """The dead loads at :attr:`nodes`, (k, 3) in mN."""
+        dead = dead_force(self._balanced)
+        per_unit = {name: force[self.nodes] for name, force in dead.per_unit.items()}
+        return DeadForce(dead.constant[self.nodes], per_unit)
 
     def __call__(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the force (...) in mN from ``u`` (..., k, 3) mm of ``nodes`` and ``theta``."""
         return jnp.vectorize(self._force, signature="(k,i),(p)->()")(u, theta)
 
     def _force(self, u: jax.Array, theta: jax.Array) -> jax.Array:
+        scene, adjacent = self._balanced, self._adjacent
+        values, number = scene.resolve(theta), np.full(len(scene.mesh.nodes), -1)
+        number[self.nodes] = np.arange(len(self.nodes))
         prescribed, sprung = (jnp.asarray(virtual[self.nodes]) for virtual in self._virtual)
-        values = self._balanced.resolve(theta)
-        terms, forces, springs = self._parts
+        connectivity = number[scene.blocks.connectivity[adjacent]]
+        gradients, weights = scene.blocks.gradients[adjacent], scene.blocks.weights[adjacent]
+        tissue = jax.tree.map(lambda array: array[adjacent], scene.block_tissue_at(theta))
 
-        def potential_at_prescribed(v: jax.Array) -> jax.Array:
-            loads = sum((t.total(v, values) for t in self._local(terms)), jnp.zeros(()))
-            return self._strain_energy(v, theta) + loads
+        def strain_energy_at_support(v: jax.Array) -> jax.Array:
+            H = jnp.einsum("bai,bqaj->bqij", v[connectivity], gradients)
+            if scene.dilatation != "pointwise":
+                H = jax.vmap(with_mean_dilatation)(H, jnp.asarray(weights))
+            return jnp.sum(weights * at_points(point_energy(scene, theta), H, tissue))
 
-        def potential_of_springs(v: jax.Array) -> jax.Array:
-            return sum((s.total(v, values) for s in self._local(springs)), jnp.zeros(()))
+        def force_of(parts: Sequence[LocalTerm | LocalForce]) -> jax.Array:
+            local = (replace(part, nodes=number[part.nodes]) for part in parts)
+            return force_on_body(local, u, values) + jnp.zeros_like(u)
 
-        force = jax.jvp(potential_at_prescribed, (u,), (prescribed,))[1]
-        force = force - jax.jvp(potential_of_springs, (u,), (sprung,))[1]
-        for follower in self._local(forces):
-            force = force - jnp.vdot(follower.total(u, values), prescribed)
-        return force - self._dead_work(values)
-
-    def _strain_energy(self, u: jax.Array, theta: jax.Array) -> jax.Array:
-        """Return the energy () in mN mm of the blocks at the support."""
-        blocks, scene = self._bulk, self._balanced
-        H = jnp.einsum("bai,bqaj->bqij", u[blocks.connectivity], blocks.gradients)
-        if scene.dilatation != "pointwise":
-            H = jax.vmap(with_mean_dilatation)(H, jnp.asarray(blocks.weights))
-        tissue = jax.tree.map(lambda array: array[self._adjacent], scene.block_tissue_at(theta))
-        density = at_points(point_energy(scene, theta), tissue, H)
-        return jnp.sum(blocks.weights * density)
-
-    @cached_property
-    def _dead(self) -> tuple[float, dict[str, float]]:
-        """The work (mN mm) of dead loads on the virtual displacement; and per unit of theta."""
-        prescribed, dead = self._virtual[0], dead_force(self._balanced)
-        if dead is None:
-            return 0.0, {}
-        per_unit = {
-            name: float(np.vdot(force, prescribed)) for name, force in dead.per_unit.items()
-        }
-        return float(np.vdot(dead.constant, prescribed)), per_unit
-
-    def _dead_work(self, values: Values) -> jax.Array:
-        constant, per_unit = self._dead
-        return sum((values[name] * work for name, work in per_unit.items()), jnp.asarray(constant))
-
-    def _local[T: (LocalTerm, LocalForce)](self, parts: Sequence[T]) -> list[T]:
-        """Return ``parts`` with nodes numbered as in ``nodes``."""
-        return [replace(part, nodes=self._renumbered[part.nodes]) for part in parts]
+        loads, springs = self._parts
+        bulk = jax.jvp(strain_energy_at_support, (u,), (prescribed,))[1]
+        external = force_of(loads) + self._dead.total(values)
+        return bulk - jnp.vdot(external, prescribed) + jnp.vdot(force_of(springs), sprung)
 
 
-def _contributions_at[T: (LocalTerm, LocalForce)](
-    parts: Sequence[T], at_support: np.ndarray
+def _contributions_at[T: (LocalTerm, LocalForce, LocalTerm | LocalForce)](
+    parts: Sequence[T], virtual: np.ndarray
 ) -> list[T]:
-    """Return the contributions of ``parts`` that have a node that ``moves`` (n,)."""
+    """Return the contributions of ``parts`` that have a node that ``virtual`` (n, 3) moves."""
     contributions: list[T] = []
     for part in parts:
-        rows = np.flatnonzero(at_support[part.nodes].any(axis=1))
+        rows = np.flatnonzero(virtual.any(axis=1)[part.nodes].any(axis=1))
         if len(rows):
             data = jax.tree.map(lambda array: array[rows], part.data)  # noqa: B023 - used at once
             contributions.append(replace(part, nodes=part.nodes[rows], data=data))

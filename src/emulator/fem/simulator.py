@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.core.errors import InputError, SolverError
+from emulator.core.errors import InputError
 from emulator.core.machine import require_cpu, require_float64
 from emulator.core.representation import TableRepr
 from emulator.fem.assembly import System
@@ -30,8 +30,11 @@ from emulator.fem.derivatives import (
     SolutionMap,
     adjoint,
     differentiable,
+    equations_of,
+    require_finite,
     sensitivities,
 )
+from emulator.fem.energy import require_shape
 from emulator.fem.linear import Outcome, find_solver
 from emulator.fem.loaded import LoadedEquilibrium
 from emulator.fem.newton import NewtonOptions
@@ -175,12 +178,8 @@ class Simulator(TableRepr):
         if self.scene.loaded_by:
             rows = self._loaded.sensitivities(u, theta)
         else:
-            rows = sensitivities(self.system, self.tangent(u, theta), u, theta)
-        if not isinstance(rows, jax.core.Tracer) and not np.isfinite(rows).all():
-            raise SolverError(
-                f"scene '{self.scene.name}': the equilibrium has no derivatives: singular tangent"
-            )
-        return rows
+            rows = sensitivities(self.system, u, theta)
+        return require_finite(self.scene, rows, "the equilibrium")
 
     def gradient_of(
         self, quantity: Quantity
@@ -248,7 +247,7 @@ class Simulator(TableRepr):
         InputError
             The mesh has no set of this name.
         """
-        return _resultant(self.reactions(u, theta), nodes_of(self.scene.mesh, name))
+        return self.reactions(u, theta)[nodes_of(self.scene.mesh, name)].sum(axis=0)
 
     def equations(self, u: jax.Array, theta: jax.Array) -> tuple[Equations, ...]:
         """Return the equations whose root is the equilibrium ``u`` (n, 3) mm at ``theta`` (p,).
@@ -257,8 +256,7 @@ class Simulator(TableRepr):
         """
         if self.scene.loaded_by:
             return self._loaded.equations(u, theta)
-        residual = lambda theta, u: self.system.residual(u, theta)  # noqa: E731
-        return (Equations(self.system, u, self.tangent(u, theta), residual),)
+        return (equations_of(self.system, u, theta),)
 
     def tangent(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the nonzeros (nnz,) of the tangent at ``u`` (n, 3) mm and ``theta`` (p,)."""
@@ -269,14 +267,8 @@ class Simulator(TableRepr):
     ) -> tuple[jax.Array, jax.Array]:
         """Return both in float64; a short theta would be read past its end without an error."""
         theta, start = jnp.asarray(theta, dtype=float), jnp.asarray(start, dtype=float)
-        for name, array, shape in (
-            ("theta", theta, (len(self.scene.parameters),)),
-            (what, start, self.scene.held.shape),
-        ):
-            if array.shape != shape:
-                raise InputError(
-                    f"scene '{self.scene.name}': {name} has shape {array.shape}; expected {shape}"
-                )
+        require_shape(self.scene, "theta", theta, (len(self.scene.parameters),))
+        require_shape(self.scene, what, start, self.scene.held.shape)
         return theta, start
 
     def __call__(self, theta: jax.Array) -> jax.Array:
@@ -292,9 +284,3 @@ class Simulator(TableRepr):
     @cached_property
     def _equilibrium(self) -> SolutionMap:
         return differentiable(self.system, self.options)
-
-
-@jax.jit
-def _resultant(forces: jax.Array, nodes: jax.Array) -> jax.Array:
-    """Return the sum (3,) of ``forces`` (n, 3) at ``nodes``."""
-    return forces[nodes].sum(axis=0)

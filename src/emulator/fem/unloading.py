@@ -33,7 +33,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.core.errors import InputError, SolverError, look_up
+from emulator.core.errors import InputError, look_up
 from emulator.core.machine import require_float64
 from emulator.fem.assembly import System
 from emulator.fem.compiled import compiled, while_loop
@@ -42,14 +42,15 @@ from emulator.fem.derivatives import (
     RootFinder,
     SolutionMap,
     differentiable,
+    equations_of,
+    require_finite,
     sensitivities,
 )
-from emulator.fem.energy import displacement_gradient, require_rest
+from emulator.fem.energy import at_points, displacement_gradient, require_rest, require_shape
 from emulator.fem.fallbacks import find_equilibrium
 from emulator.fem.inverse_motion import InverseSystem, carried_back
-from emulator.fem.line_search import largest_admissible
 from emulator.fem.linear import find_solver
-from emulator.fem.newton import NewtonOptions
+from emulator.fem.newton import NewtonOptions, largest_admissible
 from emulator.fem.solution import Solution, Status
 from emulator.geometry.discretisation import Blocks
 from emulator.mechanics.kinematics import cofactor, determinant
@@ -174,11 +175,7 @@ class Unloader:
         """
         require_float64("FEM")
         theta = jnp.asarray(theta, dtype=float)
-        if theta.shape != (len(self.scene.parameters),):
-            raise InputError(
-                f"scene '{self.scene.name}': theta has shape {theta.shape}; expected "
-                f"{(len(self.scene.parameters),)}"
-            )
+        require_shape(self.scene, "theta", theta, (len(self.scene.parameters),))
         solution = self._solution(theta, jnp.zeros(self.scene.held.shape))
         return Unloaded(**jax.block_until_ready(solution)._asdict(), loaded=self.scene)
 
@@ -192,35 +189,19 @@ class Unloader:
         SolverError
             The tangent is singular.
         """
-        w, theta = unloaded.displacement, jnp.asarray(theta, dtype=float)
-        rows = sensitivities(self.system, self.system.safe_tangent(w, theta)[0], w, theta)
-        if not np.isfinite(rows).all():
-            raise SolverError(
-                f"scene '{self.scene.name}': the stress-free shape has no derivatives: singular "
-                "tangent"
-            )
-        return rows
+        rows = sensitivities(self.system, unloaded.displacement, jnp.asarray(theta, dtype=float))
+        return require_finite(self.scene, rows, "the stress-free shape")
 
     def equations(self, w: jax.Array, theta: jax.Array) -> tuple[Equations]:
         """Return the equations whose root is ``w`` (n, 3) mm, the way to the stress-free shape."""
-        tangent = self.system.safe_tangent(w, theta)[0]
-        return (
-            Equations(self.system, w, tangent, lambda theta, w: self.system.residual(w, theta)),
-        )
+        return (equations_of(self.system, w, theta),)
 
     @cached_property
     def _solution(self) -> SolutionMap:
         return differentiable(self.system, self.options, METHODS[self.method])
 
 
-def unload(
-    scene: Scene,
-    theta: jax.Array,
-    *,
-    method: str = "inverse",
-    options: NewtonOptions = NewtonOptions(),
-    factorisation: str = "suitesparse",
-) -> Unloaded:
+def unload(scene: Scene, theta: jax.Array, **options: Any) -> Unloaded:
     """Return the stress-free shape of ``scene``, whose mesh is its shape under load at ``theta``.
 
     For many theta of a scene make one :class:`Unloader`, which is compiled once.
@@ -230,14 +211,14 @@ def unload(
     scene : the scene on its loaded mesh.
     theta : the parameters (p,), with the pressure under which the image was taken; they may lie
         outside the scene's box.
-    method, options, factorisation : see :class:`Unloader`.
+    options : the fields ``method``, ``options`` and ``factorisation`` of an :class:`Unloader`.
 
     Raises
     ------
     InputError
         Supports that move, a load that no body can be unloaded from, an unknown method.
     """
-    return Unloader(scene, method, options, factorisation).solve(theta)
+    return Unloader(scene, **options).solve(theta)
 
 
 # Methods
@@ -260,48 +241,42 @@ def _by_fixed_point(
 
     def correct(state: _FixedPointState) -> _FixedPointState:
         trial = system_at_rest(system, state.w, theta)
-        loaded = find_equilibrium(trial, options, theta, state.u)
-        load_converged = loaded.status == Status.CONVERGED
+        loaded = find_equilibrium(trial, options, theta, state.loaded.displacement)
         distance = state.w + loaded.displacement
-        relaxation = _aitken(state, distance)
+        change = distance - state.distance
+        size = jnp.sum(change**2)
+        relaxation = -state.relaxation * jnp.vdot(state.distance, change)
+        relaxation = jnp.clip(relaxation / jnp.where(size > 0.0, size, 1.0), *_RELAXATION)
+        relaxation = jnp.where(state.corrections > 0, relaxation, 1.0)
         step = -relaxation * distance
-        floor = options.shrink * system.least_volume_ratio(state.w)
-        fraction = largest_admissible(
-            lambda part: floor < system.least_volume_ratio(state.w + part * step), _SHORTEST
-        )
-        converged = jnp.max(jnp.abs(distance)) <= tolerance
+        admissible = system.keeps_volume(state.w, step, options.shrink)
+        fraction = largest_admissible(admissible, _SHORTEST)
         exhausted = state.corrections + 1 >= _MOST_CORRECTIONS
         status = jnp.where(exhausted, Status.ITERATION_LIMIT, Status.RUNNING)
         status = jnp.where(fraction > 0.0, status, Status.INVERTED_ELEMENT)
-        status = jnp.where(converged, Status.CONVERGED, status)
-        status = jnp.where(load_converged, status, loaded.status)
-        running = status == Status.RUNNING
+        status = jnp.where(jnp.max(jnp.abs(distance)) <= tolerance, Status.CONVERGED, status)
+        status = jnp.where(loaded.status == Status.CONVERGED, status, loaded.status)
         return _FixedPointState(
-            w=jnp.where(running, state.w + fraction * step, state.w),
-            u=loaded.displacement,
+            w=jnp.where(status == Status.RUNNING, state.w + fraction * step, state.w),
             distance=distance,
             relaxation=relaxation,
             corrections=state.corrections + 1,
-            iterations=state.iterations + loaded.iterations,
-            factorisations=state.factorisations + loaded.factorisations,
-            status=jnp.asarray(status, dtype=jnp.int64),
+            loaded=loaded._replace(
+                status=jnp.asarray(status, dtype=jnp.int64),
+                iterations=state.loaded.iterations + loaded.iterations,
+                factorisations=state.loaded.factorisations + loaded.factorisations,
+            ),
         )
 
-    count, running = jnp.zeros((), dtype=int), jnp.asarray(Status.RUNNING, dtype=jnp.int64)
-    first = _FixedPointState(
-        start, -start, jnp.zeros_like(start), jnp.ones(()), count, count, count, running
-    )
-    state = while_loop(lambda state: state.status == Status.RUNNING, correct, first)
-    converged = state.status == Status.CONVERGED
+    count, zero = jnp.zeros((), dtype=int), jnp.zeros(())
+    running = jnp.asarray(Status.RUNNING, dtype=jnp.int64)
+    at_start = Solution(-start, running, count, count, zero, zero)
+    first = _FixedPointState(start, jnp.zeros_like(start), jnp.ones(()), count, at_start)
+    state = while_loop(lambda state: state.loaded.status == Status.RUNNING, correct, first)
+    converged = state.loaded.converged
     w = jnp.where(converged, state.w, 0.0)
-    solution = Solution(
-        displacement=w,
-        status=state.status,
-        iterations=state.iterations,
-        factorisations=state.factorisations,
-        residual=system.relative_residual(w, theta),
-        load_reached=jnp.where(converged, 1.0, 0.0),
-    )
+    residual, load_reached = system.relative_residual(w, theta), jnp.where(converged, 1.0, 0.0)
+    solution = state.loaded._replace(displacement=w, residual=residual, load_reached=load_reached)
     return _check_corners(system, solution)
 
 
@@ -309,51 +284,32 @@ class _FixedPointState(NamedTuple):
     """The state of the fixed-point iteration.
 
     w : the displacement to the trial shape, (n, 3) mm.
-    u : the displacement that loads it, (n, 3) mm.
     distance : the distance R at the last correction, (n, 3) mm.
     relaxation : the relaxation beta of the last correction, ().
     corrections : the number of corrections.
-    iterations, factorisations : the totals over all solves.
-    status : a :class:`Status`.
+    loaded : the last solution on a trial shape, with the iterations of all and the status of this
+        iteration.
     """
 
     w: jax.Array
-    u: jax.Array
     distance: jax.Array
     relaxation: jax.Array
     corrections: jax.Array
-    iterations: jax.Array
-    factorisations: jax.Array
-    status: jax.Array
+    loaded: Solution
 
 
-def _aitken(state: _FixedPointState, distance: jax.Array) -> jax.Array:
-    """Return the relaxation () of the next correction; 1 at the first."""
-    change = distance - state.distance
-    size = jnp.sum(change**2)
-    divisor = jnp.where(size > 0.0, size, 1.0)
-    relaxation = -state.relaxation * jnp.vdot(state.distance, change) / divisor
-    return jnp.where(state.corrections > 0, jnp.clip(relaxation, *_RELAXATION), 1.0)
-
-
+@compiled
 def _check_corners(system: System, solution: Solution) -> Solution:
     """Return ``solution``, failed if an element of the stress-free mesh is inverted at its corners.
 
     A quadratic element may be inverted there and not at its quadrature points.
     """
-    inverted = ~(_least_corner_volume(system, solution.displacement) > 0.0)
-    inverted &= solution.status == Status.CONVERGED
+    mesh = system.scene.mesh
+    corners = (mesh.nodes + solution.displacement)[mesh.corners]
+    volumes = jax.vmap(determinant)(corners[:, 1:] - corners[:, :1])
+    inverted = solution.converged & ~(jnp.min(volumes) > 0.0)
     status = jnp.where(inverted, Status.INVERTED_ELEMENT, solution.status)
     return solution._replace(status=status.astype(solution.status.dtype))
-
-
-@compiled
-def _least_corner_volume(system: System, w: jax.Array) -> jax.Array:
-    """Return the least volume () in mm3 that the corners of an element enclose at x + w."""
-    mesh = system.scene.mesh
-    corners = (mesh.nodes + w)[mesh.corners]
-    edges = corners[:, 1:] - corners[:, :1]
-    return jnp.min(jax.vmap(determinant)(edges)) / 6.0
 
 
 METHODS: dict[str, RootFinder] = {"inverse": _by_inverse_motion, "fixed_point": _by_fixed_point}
@@ -365,12 +321,8 @@ METHODS: dict[str, RootFinder] = {"inverse": _by_inverse_motion, "fixed_point": 
 
 def tissue_at_rest(scene: Scene, w: jax.Array, theta: jax.Array) -> Tissue:
     """Return the material data (m, q, ...) on the mesh x + w, directions carried back."""
-    tissue = scene.tissue_at(theta)
-    if tissue.directions is None:
-        return tissue
-    h = displacement_gradient(scene, w)
-    directions = jax.vmap(jax.vmap(carried_back))(h, jnp.asarray(tissue.directions))
-    return tissue._replace(directions=directions)
+    tissue, h = scene.tissue_at(theta), displacement_gradient(scene, w)
+    return tissue._replace(directions=at_points(carried_back, h, tissue.directions))
 
 
 def scene_at_rest(scene: Scene, w: jax.Array) -> Scene:
@@ -397,49 +349,47 @@ def scene_at_rest(scene: Scene, w: jax.Array) -> Scene:
 
 
 def system_at_rest(system: System, w: jax.Array, theta: jax.Array) -> System:
-    """Return the equations of the scene on the mesh x + w, for arrays that may be traced."""
-    rest_system = System(_traced_scene_at_rest(system.scene, w, theta), system.factorisation)
+    """Return the equations of :func:`scene_at_rest` for ``w`` and ``theta`` that may be traced.
+
+    They live as long as the function that makes them, and nothing is checked.
+    """
+    scene, tissue = system.scene, tissue_at_rest(system.scene, w, theta)
+    directions, h = tissue.directions, displacement_gradient(scene, w)
+    fibres = directions if directions is None or directions.ndim == 3 else directions[:, :, 0]
+    mesh = unchecked(scene.mesh, nodes=scene.mesh.nodes + w)
+    gradients, weights = _shape_functions_at_rest(scene.discretisation, h)
+    grid = replace(scene.discretisation, mesh=mesh, gradients=gradients, weights=weights)
+    blocks: Blocks = grid
+    if scene.dilatation == "patch":
+        gradients, weights = _shape_functions_at_rest(scene.blocks, scene.blocks.gather(h))
+        blocks = replace(scene.blocks, gradients=gradients, weights=weights)
+    at_rest = unchecked(
+        scene,
+        mesh=mesh,
+        discretisation=grid,
+        blocks=blocks,
+        fibres=fibres,
+        angles=(),  # theta has turned the fibres already
+        _tissue=tissue,
+        _block_tissue=jax.tree.map(blocks.gather, tissue),
+    )
+    rest_system = System(at_rest, system.factorisation)
     # Evaluated here, so that no program inside another keeps what depends on its own tracers.
     _ = rest_system.springs, rest_system.terms, rest_system.forces, rest_system.dead
     return rest_system
 
 
-def _traced_scene_at_rest(scene: Scene, w: jax.Array, theta: jax.Array) -> Scene:
-    """Return :func:`scene_at_rest` for ``w`` (n, 3) and ``theta`` (p,) that may be traced.
-
-    Its fibres are already turned by ``theta``. It lives as long as the function that makes
-    it, and nothing is checked.
-    """
-    grid, tissue = scene.discretisation, tissue_at_rest(scene, w, theta)
-    directions = tissue.directions
-    fibres = directions if directions is None or directions.ndim == 3 else directions[:, :, 0]
-    mesh = copy.copy(scene.mesh)
-    object.__setattr__(mesh, "nodes", scene.mesh.nodes + w)
-    h = displacement_gradient(scene, w)
-    gradients, weights = _shape_functions_at_rest(grid, h)
-    rest_grid = replace(grid, mesh=mesh, gradients=gradients, weights=weights)
-    blocks: Blocks = rest_grid
-    if scene.dilatation == "patch":
-        gradients, weights = _shape_functions_at_rest(scene.blocks, scene.blocks.gather(h))
-        blocks = replace(scene.blocks, gradients=gradients, weights=weights)
-    view = copy.copy(scene)
-    for name, value in (
-        ("mesh", mesh),
-        ("discretisation", rest_grid),
-        ("blocks", blocks),
-        ("fibres", fibres),
-        ("angles", ()),
-        ("_tissue", tissue),
-        ("_block_tissue", jax.tree.map(blocks.gather, tissue)),
-    ):
-        object.__setattr__(view, name, value)
+def unchecked[T](thing: T, **values: Any) -> T:
+    """Return a frozen dataclass with other ``values``, which may be traced."""
+    view = copy.copy(thing)
+    vars(view).update(values)
     return view
 
 
 def _shape_functions_at_rest(blocks: Blocks, h: jax.Array) -> tuple[Any, Any]:
     """Return gradients (b, q, a, 3) and weights (b, q) at x + w, from ``h`` (b, q, 3, 3)."""
     f = h + jnp.eye(3, dtype=h.dtype)
-    det = jax.vmap(jax.vmap(determinant))(f)
-    inverse_transposed = jax.vmap(jax.vmap(cofactor))(f) / det[..., None, None]
+    det = at_points(determinant, f)
+    inverse_transposed = at_points(cofactor, f) / det[..., None, None]
     gradients = jnp.einsum("bqij,bqaj->bqai", inverse_transposed, blocks.gradients)
     return gradients, blocks.weights * det

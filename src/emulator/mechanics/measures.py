@@ -7,12 +7,12 @@ A law is a function of measures of the displacement gradient,
 
 which are found by calling it with a strain that records every measure read. The exponentials and
 the bulk modulus are in :math:`\varphi`, which is convex or nearly so; :math:`\xi` is a polynomial
-or close to one. The solver uses the separation (:mod:`emulator.fem.formulations.stress_iterates`).
+or close to one. The solver uses the separation (:mod:`emulator.fem.stress_iterates`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 
 import jax
@@ -31,9 +31,6 @@ _SHAPES: dict[str, tuple[int, ...]] = {
     "isochoric_I8fs": (),
     "green_lagrange": (3, 3),
 }
-
-
-_IN_CLOSED_FORM = set(_SHAPES) - {"green_lagrange"}
 
 
 def _metric(name: str, strain: Strain) -> jax.Array:
@@ -57,8 +54,6 @@ def _given(name: str) -> property:
 class GivenStrain(Strain):
     """A strain whose measures are given as independent values.
 
-    Parameters
-    ----------
     values : measure by name; :attr:`ln_J` follows from ``J_minus_1``.
     directions : as in :class:`~emulator.mechanics.kinematics.Strain`.
     """
@@ -68,9 +63,7 @@ class GivenStrain(Strain):
     def __init__(
         self, values: Mapping[str, jax.Array], directions: jax.Array | np.ndarray | None
     ) -> None:
-        object.__setattr__(self, "values", values)
-        object.__setattr__(self, "directions", directions)
-        object.__setattr__(self, "barriers", None)
+        vars(self).update(values=values, directions=directions, barriers=None)
 
     @property
     def H(self) -> jax.Array:
@@ -86,22 +79,11 @@ class GivenStrain(Strain):
     green_lagrange = _given("green_lagrange")
 
 
-class _Notes(Mapping[str, jax.Array]):
-    """Measures of a strain at rest, all zero; ``read`` lists the ones that were read."""
+class _Notes(dict[str, jax.Array]):
+    """Measures of a strain at rest, all zero: those that were read, in order."""
 
-    def __init__(self) -> None:
-        self.read: list[str] = []
-
-    def __getitem__(self, name: str) -> jax.Array:
-        if name not in self.read:
-            self.read.append(name)
-        return jnp.zeros(_SHAPES[name])
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(_SHAPES)
-
-    def __len__(self) -> int:
-        return len(_SHAPES)
+    def __missing__(self, name: str) -> jax.Array:
+        return self.setdefault(name, jnp.zeros(_SHAPES[name]))
 
 
 @lru_cache(maxsize=64)
@@ -120,16 +102,11 @@ def measures_read(law: Law) -> tuple[str, ...] | None:
         jax.eval_shape(energy, *(jnp.ones(()) for _ in law.parameters))
     except _GradientRead:
         return None
-    return tuple(notes.read)
+    return tuple(notes)
 
 
 class Measures:
-    """A law's measures as one flat vector.
-
-    Parameters
-    ----------
-    names : of the measures, from :func:`measures_read`.
-    """
+    """A law's measures as one flat vector; ``names`` are those of :func:`measures_read`."""
 
     def __init__(self, names: tuple[str, ...]) -> None:
         self.names = names
@@ -166,8 +143,10 @@ class Measures:
         :math:`J_{,ij} = J G_{ij}`, :math:`J_{,ijkl} = J (G_{ij} G_{kl} - G_{il} G_{kj})`. Other
         measures are differentiated by JAX.
         """
-        if not set(self.names) <= _IN_CLOSED_FORM:
-            return self._differentiated(H, directions, s)
+        if "green_lagrange" in self.names:
+            measures = lambda H: self.of(H, directions)  # noqa: E731
+            pulled_back = lambda H: jax.vjp(measures, H)[1](s)[0]  # noqa: E731
+            return jax.jacfwd(measures)(H), jax.jacfwd(pulled_back)(H)
         F, eye = H + jnp.eye(3, dtype=H.dtype), jnp.eye(3, dtype=H.dtype)
         strain = Strain(H, None, directions)
         J = 1.0 + strain.J_minus_1
@@ -195,19 +174,6 @@ class Measures:
         curvature += (4.0 / 9.0 * power * Q + pressure * J) * GG
         curvature += (2.0 / 3.0 * power * Q - pressure * J) * crossed
         return jnp.stack(slopes), curvature
-
-    def _differentiated(
-        self, H: jax.Array, directions: jax.Array | None, s: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Return :meth:`derivatives` of any measures, by automatic differentiation."""
-
-        def measures(H: jax.Array) -> jax.Array:
-            return self.of(H, directions)
-
-        def pulled_back(H: jax.Array) -> jax.Array:
-            return jax.vjp(measures, H)[1](s)[0]
-
-        return jax.jacfwd(measures)(H), jax.jacfwd(pulled_back)(H)
 
     def energy(
         self, constitutive: Callable[[Strain], jax.Array], directions: jax.Array | None

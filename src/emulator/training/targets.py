@@ -21,9 +21,9 @@ from emulator.fem import Simulator
 from emulator.fem.assembly import System
 from emulator.fem.campaign import at_once, in_order
 from emulator.fem.compiled import compiled
-from emulator.fem.line_search import ARMIJO, armijo, backtrack
 from emulator.fem.linear import Outcome
 from emulator.fem.linear.reuse import conjugate_gradients
+from emulator.fem.newton import ARMIJO, armijo, backtrack
 
 _GROUP = 8  # theta that share a factor
 _MIDDLES = 3  # members of a group whose tangents may be factorised, the middle first

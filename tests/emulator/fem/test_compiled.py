@@ -110,6 +110,17 @@ def test_bodies_that_differ_in_numbers_share_a_program(counted):
     assert second(ramp) == 182.0
 
 
+def test_what_a_result_does_not_depend_on_tells_programs_apart():
+    """The compiler leaves it out, so that the texts are the same."""
+
+    def program(*tables):
+        return compiled(lambda x: [x * jnp.asarray(t) for t in (*tables, np.arange(3.0))][-1])
+
+    one, more = program(np.zeros(2)), program(np.zeros(2), np.zeros(4))
+    for each in (one, more):
+        np.testing.assert_array_equal(each(2.0), [0.0, 2.0, 4.0])
+
+
 def test_a_derivatives_rule_is_its_own_bodys():
     """The same value, so the same program; the rules close over what differs."""
 

@@ -96,7 +96,7 @@ def test_means_are_weighted_by_volume():
     )
     u = jnp.asarray(0.1 * np.random.default_rng(3).normal(size=scene.mesh.nodes.shape))
     once = element_fields(scene, u, scene.centre)
-    vars(scene)["discretisation"] = doubled  # where cached_property keeps it
+    vars(scene).update(discretisation=doubled, blocks=doubled)  # where cached_property keeps them
     for name, values in element_fields(scene, u, scene.centre).items():
         np.testing.assert_allclose(values, once[name], rtol=1e-13)
 

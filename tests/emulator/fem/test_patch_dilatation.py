@@ -23,7 +23,7 @@ from emulator.fem.energy import (
 from emulator.fem.fields import element_fields
 from emulator.fem.formulations import formulation_of
 from emulator.fem.formulations.mean_dilatation import MeanDilatation
-from emulator.fem.formulations.stress_iterates import applies
+from emulator.fem.stress_iterates import applies
 from emulator.geometry.generators.box import box
 from emulator.geometry.io import write_mesh
 from emulator.geometry.patches import patches

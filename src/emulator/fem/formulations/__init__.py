@@ -1,14 +1,13 @@
 """Formulations: the unknowns of Newton's method and the linearisation of a scene's equations.
 
-Near equilibrium it is one of :data:`FORMULATIONS`; far from it, :mod:`.stress_iterates`.
+Near equilibrium it is one of :data:`FORMULATIONS`; :mod:`emulator.fem.stress_iterates` far from it.
 """
 
 from emulator.fem.assembly import System
-from emulator.fem.formulations.displacement import Displacement
+from emulator.fem.formulations.displacement import Displacement, Linearised
 from emulator.fem.formulations.mean_dilatation import Inverse, MeanDilatation
-from emulator.fem.formulations.protocol import Formulation, Linearised
 
-FORMULATIONS: dict[str, type[Displacement] | type[MeanDilatation]] = {
+FORMULATIONS: dict[str, type[Displacement]] = {
     "inverse motion": Inverse,
     "mean dilatation": MeanDilatation,
     "displacement alone": Displacement,
@@ -16,10 +15,10 @@ FORMULATIONS: dict[str, type[Displacement] | type[MeanDilatation]] = {
 """By name; the first that serves a scene is taken."""
 
 
-def formulation_of(system: System) -> Formulation:
+def formulation_of(system: System) -> Displacement:
     """Return the formulation by which Newton's method solves the equations of ``system``."""
     serving = (each for each in FORMULATIONS.values() if each.serves(system))
     return next(serving)(system)
 
 
-__all__ = ["FORMULATIONS", "Formulation", "Linearised", "formulation_of"]
+__all__ = ["FORMULATIONS", "Linearised", "formulation_of"]

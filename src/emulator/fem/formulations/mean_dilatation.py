@@ -20,7 +20,6 @@ factorised already, so the test costs one evaluation of the forces and one back-
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar
 
@@ -30,17 +29,12 @@ import jax.numpy as jnp
 from emulator.fem import condensation, inverse_motion
 from emulator.fem.assembly import System
 from emulator.fem.compiled import compiled
-from emulator.fem.condensation import Volumes
-from emulator.fem.formulations.displacement import renewed_or_kept
-from emulator.fem.formulations.protocol import Linearised, MonotonicityTest
-from emulator.fem.state import NewtonState
+from emulator.fem.formulations.displacement import Displacement, Linearised, MonotonicityTest
+from emulator.fem.solution import NewtonState
 
 
-@dataclass(frozen=True, eq=False)
-class MeanDilatation:
-    """The formulation with volume ratios and pressures (:class:`.protocol.Formulation`)."""
-
-    system: System
+class MeanDilatation(Displacement):
+    """The formulation with volume ratios and pressures."""
 
     blocks: ClassVar[Any] = condensation
     """The module that linearises the blocks and eliminates their unknowns."""
@@ -70,48 +64,41 @@ class MeanDilatation:
     ) -> Linearised:
         system = self.system
         condensed = self.blocks.linearise(system.scene, u, volumes, theta)
-        residual = system.scatter(condensed.force) + system.springs_less_loads(u, theta, load)
+        residual = system.residual_of(condensed.force, u, theta, load)
         tangent, solvable, offset_force = system.equations(condensed.tangent, u, theta, load, load)
-        residual = system.restrict(residual)
         return Linearised(tangent, solvable, residual, offset_force, condensed.couplings)
 
     def monotonicity_test(
         self, state: NewtonState, theta: jax.Array, equations: Linearised, step: jax.Array
     ) -> MonotonicityTest:
         """Return the test of natural monotonicity of fractions of ``step`` (n, 3) mm."""
-        return partial(self._test, state.u, state.auxiliary, state.load, theta, equations, step)
+        return partial(self._test, (state.u, state.auxiliary, state.load, theta), equations, step)
 
     @compiled
-    def _test(
-        self,
-        u: jax.Array,
-        volumes: Any,
-        load: jax.Array,
-        theta: jax.Array,
-        equations: Linearised,
-        step: jax.Array,
-        fraction: jax.Array,
-    ) -> jax.Array:
-        system, couplings = self.system, equations.couplings
-        trial_volumes = self.blocks.advance(system.scene, volumes, couplings, step, fraction)
-        v = u + fraction * step
-        force = system.scatter(
-            self.blocks.eliminated_force(system.scene, v, trial_volumes, theta, couplings)
-        )
-        force = system.restrict(force + system.springs_less_loads(v, theta, load))
-        remainder = 1.0 - fraction
+    def _test(self, at: Any, equations: Linearised, step: jax.Array, fraction: jax.Array) -> Any:
+        system, couplings, valid = self.system, equations.couplings, jnp.array(True)
+        u, volumes, load, theta = at
+        v, remainder = u + fraction * step, 1.0 - fraction
+        if couplings is None:
+            force = system.residual(v, theta, load)
+        else:
+            trial = couplings.advance(volumes, step[system.scene.blocks.connectivity], fraction)
+            residuals = self.blocks.residuals(system.scene, v, trial, theta)
+            force = system.residual_of(couplings.eliminated(residuals), v, theta, load)
+            valid = jnp.min(trial.change) > -1.0
         rhs = -(force + remainder * equations.offset_force)
         simplified = system.extend(system.solve(equations.tangent, rhs))
         simplified = simplified + remainder * jnp.where(system.scene.held, step, 0.0)
-        valid = jnp.array(True)
-        if isinstance(trial_volumes, Volumes):
-            valid = jnp.min(trial_volumes.change) > -1.0
-        return valid & (_norm(simplified) <= (1.0 - 0.25 * fraction) * _norm(step))
+        return valid & (
+            jnp.linalg.norm(simplified) <= (1.0 - 0.25 * fraction) * jnp.linalg.norm(step)
+        )
 
     @compiled
     def advance(self, auxiliary: Any, couplings: Any, step: jax.Array, fraction: jax.Array) -> Any:
         """Return volumes and pressures after ``fraction`` of the full ``step`` (n, 3) mm."""
-        return self.blocks.advance(self.system.scene, auxiliary, couplings, step, fraction)
+        if couplings is None:
+            return auxiliary
+        return couplings.advance(auxiliary, step[self.system.scene.blocks.connectivity], fraction)
 
 
 class Inverse(MeanDilatation):
@@ -131,9 +118,5 @@ class Inverse(MeanDilatation):
     def linearise(self, state: NewtonState, theta: jax.Array) -> Linearised:
         """Return the equations at ``state``, or with the tangent it keeps."""
         if state.displacement_only:
-            return renewed_or_kept(self.system, state, theta, state.load)
+            return self._renewed_or_kept(state, theta, state.load)
         return super().linearise(state, theta)
-
-
-def _norm(field: jax.Array) -> jax.Array:
-    return jnp.sqrt(jnp.sum(field**2))

@@ -23,12 +23,7 @@ from emulator.mechanics.laws.volumetric import quadratic
 
 
 def energy(
-    strain: Strain,
-    C: jax.Array,
-    b_f: jax.Array,
-    b_t: jax.Array,
-    b_fs: jax.Array,
-    kappa: jax.Array,
+    strain: Strain, C: jax.Array, b_f: jax.Array, b_t: jax.Array, b_fs: jax.Array, kappa: jax.Array
 ) -> jax.Array:
     """Return the strain energy density in kPa; ``C`` and ``kappa`` in kPa."""
     E, f = strain.green_lagrange, strain.fibre

@@ -101,8 +101,3 @@ LAWS = (
 def textbook_from_released(a: float, a_f: float) -> tuple[float, float]:
     """Return textbook ``(a, a_f)`` of equal energies in fibre tension from the released ones."""
     return 2.0 * a, 2.0 * a_f
-
-
-def released_from_textbook(a: float, a_f: float) -> tuple[float, float]:
-    """Return the inverse of :func:`textbook_from_released`."""
-    return 0.5 * a, 0.5 * a_f

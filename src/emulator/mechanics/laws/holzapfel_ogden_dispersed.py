@@ -63,16 +63,10 @@ def mean_stretch(strain: Strain, dispersion: jax.Array) -> jax.Array:
     return dispersion * strain.isochoric_I1_minus_3 + along
 
 
+_FIBRES = (modulus("a_f"), number("b_f"), number("dispersion", 0.0, 1.0 / 3.0))
 HOLZAPFEL_OGDEN_DISPERSED_UNSWITCHED = Law(
     "holzapfel_ogden_dispersed_unswitched",
-    (
-        modulus("a"),
-        number("b"),
-        modulus("a_f"),
-        number("b_f"),
-        number("dispersion", 0.0, 1.0 / 3.0),
-        modulus("kappa"),
-    ),
+    (modulus("a"), number("b"), *_FIBRES, modulus("kappa")),
     energy_unswitched,
     fibres=True,
     shape_moduli=("a", "a_f"),

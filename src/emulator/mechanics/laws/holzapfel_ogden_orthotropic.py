@@ -40,19 +40,10 @@ def energy(
     return holzapfel_ogden.energy(strain, a, b, a_f, b_f, kappa) + sheets + shear
 
 
+_EXPONENTIALS = [q for s in ("", "_f", "_s", "_fs") for q in (modulus("a" + s), number("b" + s))]
 HOLZAPFEL_OGDEN_ORTHOTROPIC = Law(
     "holzapfel_ogden_orthotropic",
-    (
-        modulus("a"),
-        number("b"),
-        modulus("a_f"),
-        number("b_f"),
-        modulus("a_s"),
-        number("b_s"),
-        modulus("a_fs"),
-        number("b_fs"),
-        modulus("kappa"),
-    ),
+    (*_EXPONENTIALS, modulus("kappa")),
     energy,
     fibres=True,
     sheets=True,

@@ -106,7 +106,7 @@ class Law:
         volumetric part, by that factor. Regions of a scene scale these; a law without them cannot
         have regions.
     exponential : whether stress grows exponentially with strain. It only affects how the solver
-        starts, see :mod:`emulator.fem.formulations.stress_iterates`.
+        starts, see :mod:`emulator.fem.stress_iterates`.
     objective : whether a rotation of the body leaves the energy unchanged. A law of small strains
         is not.
     simpler : laws with one effect less, which take some of its parameters: the effect's name, and

@@ -35,14 +35,14 @@ import jax
 import jax.numpy as jnp
 
 from emulator.fem.assembly import System
-from emulator.fem.compiled import compiled, cond, while_loop
+from emulator.fem.compiled import Number, compiled, cond, while_loop
 from emulator.fem.condensation import block_derivatives
-from emulator.fem.energy import at_points, displacement_gradient, seen_by_law
-from emulator.fem.formulations.protocol import Linearised
-from emulator.fem.line_search import largest_admissible
+from emulator.fem.energy import at_points, law_gradients
+from emulator.fem.formulations.displacement import Linearised
 from emulator.fem.linear import Outcome
 from emulator.fem.material_point import MaterialPoint
-from emulator.mechanics.measures import Measures, measures_read
+from emulator.fem.newton import largest_admissible
+from emulator.mechanics.measures import measures_read
 from emulator.scenes.scene import Scene
 from emulator.scenes.tissue import Tissue
 
@@ -82,8 +82,6 @@ class _FullStep(NamedTuple):
 class StressIterates:
     """The iteration for one theta at one load factor.
 
-    Parameters
-    ----------
     system : the equations, of a scene that :func:`applies`.
     shrink : the least fraction of the present smallest ``J`` that a step may leave.
     theta : the parameters, (p,).
@@ -104,13 +102,11 @@ class StressIterates:
         self,
         state: StressState,
         load_stiffness: jax.Array,
-        geometric: jax.Array | float = 1.0,
+        geometric: Number = 1.0,
         again: jax.Array | bool = False,
     ) -> StressState:
         """Return the state after one iteration.
 
-        Parameters
-        ----------
         state : the state before the iteration.
         load_stiffness : the factor of the loads' stiffness in the tangent.
         geometric : the fraction of the stresses' change since rest that has a geometric stiffness.
@@ -127,9 +123,11 @@ class StressIterates:
             force = equations.residual + equations.offset_force
             # Tangents change so much from rest that the last factor does not help.
             solution, outcome = system.attempt(equations.tangent, -force, may_reuse=False)
-            step, definite = _full_step(
-                system, state.u, theta, load, equations.solvable, force, solution, outcome
-            )
+            definite = outcome == Outcome.OK
+            if system.forces:  # the tangent is not symmetric, so check that the step descends
+                definite &= jnp.vdot(force, solution) <= 0.0
+            step = system.extend(solution) + system.support_offset(state.u, theta, load)
+            step = jnp.where(equations.solvable, step, jnp.nan)
             return _FullStep(step, definite, before.tries + 1)
 
         most = jnp.where(again, 2, 1)
@@ -140,37 +138,22 @@ class StressIterates:
 
     def _advance(self, state: StressState, step: jax.Array) -> StressState:
         """Return the state after the part of a step that inverts no element."""
-        fraction = self._fraction(state.u, step)
-        u, measures = _advanced(self.system, state.u, state.measures, self.theta, step, fraction)
-        _, error = self.system.admissible_balance(u, self.theta, self.load)
+        system = self.system
+        admissible = system.keeps_volume(state.u, step, self.shrink)
+        fraction = largest_admissible(admissible, _SHORTEST)
+        u, measures = _advanced(system, state.u, state.measures, self.theta, step, fraction)
+        _, error = system.admissible_balance(u, self.theta, self.load)
         return state._replace(
             u=u, measures=measures, error=error, fraction=fraction, definite=jnp.array(True)
         )
-
-    def _fraction(self, u: jax.Array, step: jax.Array) -> jax.Array:
-        """Return the fraction of a step that inverts no element; 0 if almost none does."""
-        floor = self.shrink * self.system.least_volume_ratio(u)
-        return largest_admissible(
-            lambda fraction: floor < self.system.least_volume_ratio(u + fraction * step), _SHORTEST
-        )
-
-
-def _law_gradients(scene: Scene, u: jax.Array) -> jax.Array:
-    """Return the displacement gradients (b, q, 3, 3) that the law sees at ``u`` (n, 3) mm."""
-    return seen_by_law(scene, displacement_gradient(scene, u))
 
 
 @compiled
 def _measures_of(system: System, u: jax.Array, theta: jax.Array) -> jax.Array:
     """Return the strain measures (b, q, k) of the displacement ``u`` (n, 3) mm."""
-    scene, names = system.scene, measures_read(system.scene.law)
-    assert names is not None, "see applies"
-    measures = Measures(names)
-    return at_points(
-        lambda H, at: measures.of(H, at.directions),
-        scene.block_tissue_at(theta),
-        _law_gradients(scene, u),
-    )
+    scene, measures = system.scene, MaterialPoint(system.scene, theta).measures
+    own = lambda H, at: measures.of(H, at.directions)  # noqa: E731
+    return at_points(own, law_gradients(scene, u), scene.block_tissue_at(theta))
 
 
 @compiled
@@ -181,44 +164,20 @@ def _equations(
     theta: jax.Array,
     load: jax.Array,
     load_stiffness: jax.Array,
-    geometric: jax.Array | float,
+    geometric: Number,
 ) -> Linearised:
     """Return the equations of a step."""
-    scene = system.scene
-    point = MaterialPoint(scene, theta)
+    scene, point = system.scene, MaterialPoint(system.scene, theta)
 
     def linearise(H: jax.Array, own: jax.Array, at: Tissue) -> tuple[jax.Array, ...]:
         return point.linearise(H, own, at, geometric)
 
     tissue = scene.block_tissue_at(theta)
-    stress, moduli, known = at_points(linearise, tissue, _law_gradients(scene, u), measures)
+    stress, moduli, known = at_points(linearise, law_gradients(scene, u), measures, tissue)
     forces, bulk = block_derivatives(scene, u, stress, moduli, known)
-    rest = system.springs_less_loads(u, theta, load)
-    residual = system.restrict(system.scatter(forces) + rest)
+    residual = system.residual_of(forces, u, theta, load)
     tangent, solvable, offset_force = system.equations(bulk, u, theta, load_stiffness, load)
-    return Linearised(tangent, solvable, residual, offset_force, None)
-
-
-@compiled
-def _full_step(
-    system: System,
-    u: jax.Array,
-    theta: jax.Array,
-    load: jax.Array,
-    solvable: jax.Array,
-    force: jax.Array,
-    solution: jax.Array,
-    outcome: jax.Array,
-) -> tuple[jax.Array, jax.Array]:
-    """Return the full step (n, 3) mm, NaN where there is none, and whether K is definite.
-
-    force : the force (f,) in mN that the ``solution`` (f,) of the equations balances.
-    """
-    definite = outcome == Outcome.OK
-    if system.forces:  # the tangent is not symmetric, so check that the step descends
-        definite &= jnp.vdot(force, solution) <= 0.0
-    step = system.extend(solution) + system.support_offset(u, theta, load)
-    return jnp.where(solvable, step, jnp.nan), definite
+    return Linearised(tangent, solvable, residual, offset_force)
 
 
 @compiled
@@ -232,12 +191,10 @@ def _advanced(
 ) -> tuple[jax.Array, jax.Array]:
     """Return the displacement (n, 3) mm and measures (m, q, k) after ``fraction`` of the step."""
     scene, point = system.scene, MaterialPoint(system.scene, theta)
-    H, change = jax.jvp(lambda v: _law_gradients(scene, v), (u,), (step,))
-    measures_after = at_points(point.at_stress, scene.block_tissue_at(theta), H, change, measures)
+    H, change = jax.jvp(lambda v: law_gradients(scene, v), (u,), (step,))
+    after = at_points(point.at_stress, H, change, measures, scene.block_tissue_at(theta))
     advances = fraction > 0.0
-    return jnp.where(advances, u + fraction * step, u), jnp.where(
-        advances, measures_after, measures
-    )
+    return jnp.where(advances, u + fraction * step, u), jnp.where(advances, after, measures)
 
 
 def applies(scene: Scene) -> bool:

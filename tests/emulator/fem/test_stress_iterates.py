@@ -9,10 +9,10 @@ import pytest
 import emulator as em
 from emulator.fem.assembly import System
 from emulator.fem.fallbacks import find_equilibrium
-from emulator.fem.formulations.stress_iterates import StressIterates, applies
 from emulator.fem.linear import Outcome
 from emulator.fem.material_point import MaterialPoint, fractions_at_stress
 from emulator.fem.newton import NewtonOptions
+from emulator.fem.stress_iterates import StressIterates, applies
 from emulator.geometry.generators.box import box
 from emulator.mechanics.laws import find_law
 from emulator.mechanics.laws.law import Law, modulus

@@ -7,7 +7,7 @@ import pytest
 
 import emulator as em
 from emulator.fem.fallbacks import find_equilibrium
-from emulator.fem.line_search import largest_admissible
+from emulator.fem.newton import largest_admissible
 
 
 def conditions(jaxpr):
