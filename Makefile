@@ -19,8 +19,9 @@ OLDEST_TESTS := tests/test_package.py $(addprefix tests/emulator/,mechanics scen
 demo: $(STAMP)
 	@$(BIN)/calibrate demo --out $(OUT)
 
+# Programs run once or twice here, so the compiler's expensive passes cost more than they save.
 test: $(STAMP)
-	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile --durations=20
+	JAX_DISABLE_MOST_OPTIMIZATIONS=1 $(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile --durations=20
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow

@@ -12,6 +12,8 @@ from studies.sheep_myocardium.__main__ import main
 
 from emulator.core.errors import InputError
 
+pytestmark = pytest.mark.slow
+
 
 def write_heart(folder):
     """A heart of made-up numbers: forces that rise with the cube of their amounts."""

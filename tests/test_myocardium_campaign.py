@@ -10,6 +10,8 @@ from studies.sheep_myocardium.doubts import doubts
 from studies.sheep_myocardium.experiment import Heart
 from studies.sheep_myocardium.solver import without_mesh
 
+pytestmark = pytest.mark.slow
+
 
 def test_a_meshs_error_is_taken_off_by_its_order():
     """Forces that are too large by 0.2 h^1.2, on 3 and on 5 cells."""

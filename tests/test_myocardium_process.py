@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from studies.sheep_myocardium import cube, process
 
+pytestmark = pytest.mark.slow
+
 
 def position(**values):
     """Position (p,) in the box of these values, of others the lowest."""

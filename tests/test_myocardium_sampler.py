@@ -12,6 +12,8 @@ from numpyro import handlers
 from studies.sheep_myocardium import chains, inference, moves, population, twins
 from studies.sheep_myocardium.experiment import Curve, Heart
 
+pytestmark = pytest.mark.slow
+
 
 class SeenLogs(NamedTuple):
     """A heart of which logarithms of its parameters are seen."""

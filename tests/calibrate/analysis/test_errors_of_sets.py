@@ -103,6 +103,7 @@ def test_sds_are_those_of_posteriors_of_data_with_a_gain():
     np.testing.assert_allclose(list(found.values()), np.mean(sds, axis=0) / 0.3, rtol=0.06)
 
 
+@pytest.mark.slow
 def test_sds_are_those_of_posteriors_whose_share_is_inferred():
     """Six points of one curve; lam and the share on a grid."""
     words = {"law": {**CURVE, "share_scale": 0.1}}

@@ -43,7 +43,7 @@ def slowly(*values):
     return [pytest.param(value, marks=pytest.mark.slow) for value in values]
 
 
-@pytest.mark.parametrize("factor", [-1.0, *slowly(0.0, 0.2, 5.0)])
+@pytest.mark.parametrize("factor", [0.2, *slowly(-1.0, 0.0, 5.0)])
 def test_gradients_that_are_not_the_map_s(beam, fem, factor):
     """Acceptance knows the values: draws are slow, or right, or the certificate sees it."""
     wrong = linear_forward(beam, size=0.02, of=WrongGradients, factor=factor)

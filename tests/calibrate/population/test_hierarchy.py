@@ -30,14 +30,14 @@ def data_of(model, theta, seed, sd=0.05):
     return np.asarray(exact["displacement"]) + noise
 
 
-def members_of(model, noise, count=6):
+def members_of(model, noise, count=5):
     logs = np.log([70.0, 80.0]) + 0.12 * np.random.default_rng(5).normal(size=(count, 2))
     return {f"b{i}": (model, data_of(model, np.exp(x), i, noise)) for i, x in enumerate(logs)}
 
 
 @pytest.fixture(scope="module")
 def found(beam):
-    """Six members, one without data, one with a missing value and an unknown noise sd."""
+    """Five members, one without data, one with a missing value and an unknown noise sd."""
     model = model_of(beam, sd=0.2)
     members = members_of(model, noise=0.2)
     members["b1"] = (model, None)
@@ -60,7 +60,7 @@ def test_the_mean_of_linear_gaussian_members_is_normal(beam):
     wide = (Parameter("mu", "kPa", 1.0, 160.0), Parameter("lam", "kPa", 1.0, 160.0))
     scene = replace(beam, parameters=wide)
     model = model_of(scene, known={"lam": 80.0}, prior={"mu": dist.Uniform(1.0, 160.0)})
-    truth = 75.0 + 5.0 * np.random.default_rng(1).normal(size=5)
+    truth = 75.0 + 5.0 * np.random.default_rng(1).normal(size=3)
     members = {f"b{i}": (model, data_of(model, [t], i)) for i, t in enumerate(truth)}
     found = cal.hierarchy(
         members,
@@ -74,7 +74,7 @@ def test_the_mean_of_linear_gaussian_members_is_normal(beam):
     shift = (forward.matrix[NODES, :, 1] * 80.0 + forward.shift[NODES]).ravel()
     estimates = [(y.ravel() - shift) @ column / (column @ column) for _, y in members.values()]
     variance = 5.0**2 + 0.05**2 / (column @ column)
-    precision = 5 / variance + 1 / 10.0**2
+    precision = 3 / variance + 1 / 10.0**2
     mean = (np.sum(estimates) / variance + 80.0 / 10.0**2) / precision
     row = found.summary()["median[mu]"]
     close(found.draws()["median[mu]"], mean, precision**-0.5, row["ess_bulk"])
@@ -88,6 +88,7 @@ def test_the_mean_of_linear_gaussian_members_is_normal(beam):
     close(first, exact, weights.sum() ** -0.5, found.summary()["mu[b0]"]["ess_bulk"])
 
 
+@pytest.mark.slow
 def test_one_member_has_its_posterior_under_the_population(beam):
     """Of a known population, which as a prior is cal.Population."""
     known = {"lam": 90.0}
@@ -135,7 +136,7 @@ def test_draws_have_names_and_units(found):
     assert found.tree["posterior"]["mu"].attrs["units"] == "kPa"
     assert np.all(np.abs(draws["correlation[mu, lam]"]) < 1.0)
     assert np.all((draws["mu[b1]"] > 50.0) & (draws["mu[b1]"] < 100.0))
-    assert "Population of 6 members" in repr(found)
+    assert "Population of 5 members" in repr(found)
 
 
 def test_a_new_member_is_predicted_through_its_model(found, beam):
@@ -158,7 +159,7 @@ def test_it_is_a_prior_of_the_next_member(found, beam):
     prior = found.as_prior()
     new = found.new_member()
     assert prior.median["mu"] == pytest.approx(np.exp(np.log(new["mu"]).mean()))
-    assert prior.source == "a hierarchy of 6 members"
+    assert prior.source == "a hierarchy of 5 members"
     assert "mu" in prior.prior(beam)
 
 

@@ -195,6 +195,7 @@ def test_one_member_is_no_population_and_data_are_of_one(file, capsys, tmp_path)
     assert "has members of a population" in complaint(capsys, *words)
 
 
+@pytest.mark.slow
 def test_identify_before_knows_the_errors_of_a_file(file, capsys):
     """A camera that moved by millimetres: far less is told of a beam that bends by nine."""
 

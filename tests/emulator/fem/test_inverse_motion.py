@@ -155,7 +155,10 @@ def test_the_tangent_is_the_derivative_of_the_residual(law, order, dilatation):
     assert_tangent(ventricle(law, order, dilatation))
 
 
-@pytest.mark.parametrize("load", ["gravity", "traction", "dead_pressure"])
+slowly = [pytest.param(load, marks=pytest.mark.slow) for load in ("gravity", "dead_pressure")]
+
+
+@pytest.mark.parametrize("load", ["traction", *slowly])
 def test_the_tangent_has_loads_that_depend_on_the_shape_at_rest(load):
     assert_tangent(loaded_block(LOADS[load], supports=(em.Support("left"), SLIDING)))
 

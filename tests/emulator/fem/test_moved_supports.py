@@ -71,6 +71,7 @@ def test_derivatives_are_central_differences(simulator, k):
     np.testing.assert_allclose(by_jvp, expected, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_reverse_derivatives_are_forward_ones(simulator):
     weight = jnp.asarray(np.random.default_rng(0).normal(size=simulator.scene.held.shape))
     back = jax.grad(lambda t: jnp.vdot(weight, simulator(t)))(THETA)
@@ -78,6 +79,7 @@ def test_reverse_derivatives_are_forward_ones(simulator):
     np.testing.assert_allclose(back, forward, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_series_follows_the_plates_exactly(simulator):
     scene = simulator.scene
     series = expand(simulator, scene.theta(mu=3.0, shear=0.2, stretch=0.05), order=3)
@@ -119,6 +121,7 @@ def test_a_path_is_its_points(simulator):
     assert int(found.iterations[2:].sum()) < sum(cold[2:])
 
 
+@pytest.mark.slow
 def test_a_curve_of_forces_is_differentiable(simulator):
     force = SupportForce(simulator.scene, "top", (1.0, 0.0, 0.0))
 
@@ -132,6 +135,7 @@ def test_a_curve_of_forces_is_differentiable(simulator):
     np.testing.assert_allclose(slope[1:], by_differences[1:], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_path_leaves_rest_as_a_solve_does(simulator):
     """Supports that jump, alone, are no start: a path's first point is a cold solve."""
     thetas = curve(simulator)[2:4]

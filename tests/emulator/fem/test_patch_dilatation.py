@@ -204,6 +204,7 @@ def test_solutions_inside_jit(body):
     )
 
 
+@pytest.mark.slow
 def test_solutions_and_their_sensitivities(body):
     simulator, theta = em.Simulator(body), body.centre
     solution = simulator.solve(theta)

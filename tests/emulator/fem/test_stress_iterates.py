@@ -152,6 +152,7 @@ def by_python(simulator, theta, start=None):
     return find_equilibrium(simulator.system, simulator.options, theta, start)
 
 
+@pytest.mark.slow
 def test_no_tangent_on_the_way_is_indefinite(ventricle, monkeypatch):
     simulator, outcomes, attempt = em.Simulator(ventricle), [], System.attempt
 
@@ -242,6 +243,7 @@ def test_with_mean_dilatation_they_converge_quadratically(dilated):
     assert all(after < 10.0 * before**1.6 for before, after in pairwise(last))
 
 
+@pytest.mark.slow
 def test_with_mean_dilatation_they_end_where_newton_does(dilated):
     scene = dilated
     ramps, volumes = (
@@ -252,7 +254,7 @@ def test_with_mean_dilatation_they_end_where_newton_does(dilated):
     assert int(ramps.iterations) <= 0.6 * int(volumes.iterations)  # 10 and 22
 
 
-@pytest.mark.parametrize("order", [pytest.param(1, marks=pytest.mark.slow), 2])
+@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_body_that_is_pulled_by_its_face_climbs_the_ramps(order):
     """Prescribed displacements: fewer than Newton's iterations, the same end."""
     mesh = box((10.0, 10.0, 10.0), (2, 2, 2), order)

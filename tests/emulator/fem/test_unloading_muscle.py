@@ -38,6 +38,7 @@ def test_the_unloaded_shape_loaded_from_rest_is_the_mesh(transverse):
     assert float(jnp.abs(passive.displacement - unloaded.displacement).max()) > 0.1
 
 
+@pytest.mark.slow
 def test_a_heart_imaged_at_rest_contracts():
     """Unloaded without tension, then loaded with it, differentiably; by hand in two steps."""
     plain = contracting(0.0)

@@ -107,6 +107,7 @@ def test_the_finer_mesh_keeps_both_bodies(bodies, scene):
         assert len(fine.scene.mesh.node_set(name)) == len(np.unique(apart.mesh.surface))
 
 
+@pytest.mark.slow
 def test_regions_are_bodies(bodies, scene):
     stiffness = {"stiffness_1": 1.0, "stiffness_2": 2.0}
     both = replace(scene, regions=bodies.body + 1, constants={"lam": 30.0, **stiffness})

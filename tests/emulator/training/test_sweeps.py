@@ -64,6 +64,7 @@ def test_they_end_where_fem_does(beam, simulator, swept):
     np.testing.assert_allclose(runs.energy[0], energy, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_supports_that_move_are_followed(cube):
     simulator = em.Simulator(cube)
     swept = sweep_box(simulator, 30, 0)

@@ -34,6 +34,7 @@ def test_what_holds_exactly(case):
     assert [row for row in rows if not row.passed] == []
 
 
+@pytest.mark.slow
 def test_the_tangent_is_the_derivative_of_the_residual():
     """Both triangles of it: its upper triangle alone would leave a remainder of order one."""
     rows = taylor_of_energy("P1", em.Simulator(block("P1")))

@@ -103,7 +103,7 @@ def sliding(law, transverse, **changes) -> Scene:
     )
 
 
-@pytest.mark.parametrize("J", [0.97, 0.9])
+@pytest.mark.parametrize("J", [pytest.param(0.97, marks=pytest.mark.slow), 0.9])
 @pytest.mark.parametrize("dilatation", ["pointwise", "mean"])
 def test_a_strip_shortens_as_it_does_by_hand(J, dilatation):
     r"""With :math:`W = \mu/2 (I_1 - 3) - \mu \ln J + \lambda/2 (\ln J)^2` nothing pulls at the ends,
@@ -134,6 +134,7 @@ def test_tension_in_every_direction_alike_takes_the_volume_alone():
     np.testing.assert_allclose((3.0 + 5.0) * stretch**2, 3.0 - 60.0 * np.log(stretch), rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_supports_hold_what_the_tissue_pulls():
     """A strip of 2 mm glued at both ends: the supports' work on stretching it is the energy's."""
     scene = sliding("neo_hookean", 0.0, constants={"lam": 20.0})
