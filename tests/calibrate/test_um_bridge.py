@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 
 import calibrate as cal
-import emulator as em
 from calibrate.um_bridge import serve
 from emulator.surrogates.fem import fem_forward
 from linear_support import linear_forward

@@ -43,13 +43,14 @@ def slowly(*values):
     return [pytest.param(value, marks=pytest.mark.slow) for value in values]
 
 
-@pytest.mark.parametrize("factor", [0.2, *slowly(-1.0, 0.0, 5.0)])
+@pytest.mark.parametrize("factor", [-1.0, *slowly(0.0, 0.2, 5.0)])
 def test_gradients_that_are_not_the_map_s(beam, fem, factor):
     """Acceptance knows the values: draws are slow, or right, or the certificate sees it."""
     wrong = linear_forward(beam, size=0.02, of=WrongGradients, factor=factor)
     model = linear_model(beam, forward=wrong)
     data = exact_data(linear_model(beam, forward=fem))
-    posterior = cal.sample(model, data, options=OPTIONS, predictions=False)
+    options = cal.NUTSOptions(warmup=100, draws=150, rounds=1)  # a wrong gradient makes long paths
+    posterior = cal.sample(model, data, options=options, predictions=False)
     verdict = cal.certify(posterior, LinearSimulator(fem), draws=100).verdict
     points, weights = grid_of(), quadrature(fem, data)
     mean = weights @ points
