@@ -83,7 +83,8 @@ class _Program:
             return jax.tree.unflatten(form, jax.core.eval_jaxpr(jaxpr, arrays, *leaves))
 
         evaluate.__name__ = name
-        self.own: Any = jax.jit(evaluate)
+        # Without unused arguments the texts of two bodies could agree where their shapes do not.
+        self.own: Any = jax.jit(evaluate, keep_unused=True)
         self.shared: Any = None
         self.arrays = traced.consts
         self.inside = is_traced(self.arrays)  # whether this is part of a larger trace
@@ -95,9 +96,7 @@ class _Program:
         if self.inside or any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
             return self.own(self.arrays, leaves)
         if self.shared is None:
-            # The text has no arrays that its results do not depend on: their types are added.
-            types = str([jax.typeof(array) for array in self.arrays])
-            text = types + self.own.lower(self.arrays, leaves).as_text()
+            text = self.own.lower(self.arrays, leaves).as_text()
             self.shared = PROGRAMS.same_as(text, self.own)
         return self.shared(self.arrays, leaves)
 

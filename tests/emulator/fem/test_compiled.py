@@ -119,6 +119,8 @@ def test_what_a_result_does_not_depend_on_tells_programs_apart():
     one, more = program(np.zeros(2)), program(np.zeros(2), np.zeros(4))
     for each in (one, more):
         np.testing.assert_array_equal(each(2.0), [0.0, 2.0, 4.0])
+    by_size = {size: compiled(lambda x, last=size - 1: (x[last], 1.0)[1]) for size in (3, 2)}
+    assert [last(jnp.ones(size)) for size, last in by_size.items()] == [1.0, 1.0]
 
 
 def test_a_derivatives_rule_is_its_own_bodys():
