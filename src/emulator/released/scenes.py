@@ -20,10 +20,9 @@ from emulator.geometry.mesh import Mesh, boundary_facets, orient
 from emulator.mechanics.laws import find_law
 from emulator.scenes.loads import Gravity, Load, PublishedPressure
 from emulator.scenes.parameter_space import Parameter
-from emulator.scenes.scene import Scene
+from emulator.scenes.scene import ENDOCARDIUM, Scene
 from emulator.scenes.supports import Support
 
-PRESSURE_SURFACE = "endocardium"
 _POINTER = b"version https://git-lfs"  # first bytes of a git-lfs file that was not fetched
 _GRAVITY = Gravity(density=1.0, direction=(0.0, 0.0, -1.0), acceleration=9.80)
 
@@ -85,7 +84,7 @@ _MODELS = {
             Parameter("a_f", "kPa", 1.5, 5.18, "log"),
             Parameter("b_f", "", 1.0, 4.46, "log"),
         ),
-        (PublishedPressure(PRESSURE_SURFACE, pressure=1.06658),),  # 8 mmHg
+        (PublishedPressure(ENDOCARDIUM, pressure=1.06658),),  # 8 mmHg
         MappingProxyType({"kappa": 25.0}),
     ),
 }
@@ -160,7 +159,7 @@ def _pressed_facets(root: str | Path, model: str, elements: np.ndarray) -> dict[
             f"published data: {len(loaded) - sum(inside)} of the {len(loaded)} pressed facets "
             f"of {model} are not on the surface of its elements"
         )
-    return {PRESSURE_SURFACE: surface[inside]}
+    return {ENDOCARDIUM: surface[inside]}
 
 
 class PublishedTests(NamedTuple):

@@ -144,14 +144,7 @@ class Uniform:
 
 
 def _rotation(depth: np.ndarray, axis: np.ndarray, angles: Angles) -> tuple[FibreAngles, ...]:
-    """Return the rotation about ``axis`` by parameters; none if both angles are numbers.
-
-    Parameters
-    ----------
-    depth : relative depth in the wall (m,) or (m, q), 0 on the endocardium, 1 on the epicardium.
-    axis : the unit vectors of rotation, (..., 3).
-    angles : the angles on endocardium and epicardium.
-    """
+    """Return the rotation about ``axis`` (..., 3) by the ``angles`` that are parameters, if any."""
     shares: dict[str, np.ndarray] = {}
     for angle, share in zip(angles, (1.0 - depth, depth), strict=True):
         if isinstance(angle, str):

@@ -215,13 +215,9 @@ def twisting_cube(
 
 
 def twist(points: np.ndarray, centre: np.ndarray, degrees: float) -> np.ndarray:
-    """Return the displacement (k, 3) of a rigid rotation of ``points`` (k, 3).
+    """Return the displacement (k, 3) of a rigid rotation of ``points`` (k, 3) mm by ``degrees``.
 
-    Parameters
-    ----------
-    points : the coordinates (k, 3) in mm.
-    centre : a point (3,) on the axis of rotation, which is parallel to x.
-    degrees : the angle of rotation.
+    The axis of rotation is parallel to x, through ``centre`` (3,).
     """
     angle = np.deg2rad(degrees)
     rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
