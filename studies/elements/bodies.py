@@ -19,7 +19,6 @@ from emulator.geometry.fibres import (
     from_nodes,
     nodal_depth,
     of_elements,
-    rule_based_fibres,
     turned,
     unit,
 )
@@ -27,6 +26,7 @@ from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.refinement import to_linear, to_quadratic
 from emulator.scenes.built_in.ventricles import HELIX
+from emulator.scenes.fibre_rules import Helix
 from emulator.scenes.scene import Scene
 
 
@@ -69,7 +69,7 @@ def of_nodes(*sizes: int) -> Scene:
     """A fibre at each corner, interpolated."""
     scene = ventricle(*sizes)
     linear, depth = _on_linear(scene.mesh)
-    fibres = from_nodes(linear, turned(depth, HELIX, (0.0, 0.0, 1.0)).fibres, 2)
+    fibres = from_nodes(linear, turned(depth, HELIX, (0.0, 0.0, 1.0))[0], 2)
     return replace(scene, fibres=fibres, origin={})
 
 
@@ -82,14 +82,14 @@ def of_linear_depth(*sizes: int) -> Scene:
         np.einsum("qa,ma->mq", at, depth.value[linear.elements]),
         unit(np.einsum("qa,mai->mqi", at, depth.normal[linear.elements])),
     )
-    return replace(scene, fibres=turned(wall, HELIX, (0.0, 0.0, 1.0)).fibres, origin={})
+    return replace(scene, fibres=turned(wall, HELIX, (0.0, 0.0, 1.0))[0], origin={})
 
 
 def straight(*sizes: int) -> Scene:
     """Quadratic elements with straight edges."""
     scene = ventricle(*sizes)
     mesh = to_quadratic(human_ventricle(*sizes, grading=1.5))
-    return replace(scene, mesh=mesh, fibres=rule_based_fibres(mesh, angles=HELIX), origin={})
+    return replace(scene, mesh=mesh, fibres=Helix(HELIX).directions(mesh)[0], origin={})
 
 
 def linear(*sizes: int, **changes: object) -> Scene:

@@ -21,7 +21,7 @@ from studies.error_bar.tables import ESTIMATES, effectivities, polishes
 
 import emulator as em
 from calibrate.figures import pyplot
-from emulator.accuracy.estimate import error_bar
+from emulator.accuracy.estimate import ErrorBar
 from emulator.core.store import write_json
 from emulator.fem import run_campaign, sobol
 from emulator.scenes import Scene
@@ -76,7 +76,7 @@ class Judge:
     def __init__(self, scene: Scene) -> None:
         self.scene, self.simulator = scene, em.Simulator(scene)
         nothing = self._nothing()
-        self.present = error_bar(nothing, self.simulator)
+        self.present = ErrorBar(nothing, self.simulator)
         self.centre = centre_estimate(self.simulator)
         self.newton = jax.jit(lambda u, theta: newton_step(self.simulator.system, u, theta))
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import emulator as em
-from emulator.accuracy.distance import valid_state
+from emulator.accuracy.estimate import valid_state
 from emulator.fem.linear.reuse import conjugate_gradients
 
 ITERATIONS = 4

@@ -21,9 +21,9 @@ from calibrate.figures import pyplot
 from emulator.accuracy.comparison import evaluate
 from emulator.core.store import write_json
 from emulator.fem import run_campaign, sobol
-from emulator.geometry.fibres import rule_based_fibres
 from emulator.geometry.generators.ellipsoid import EllipsoidalWall, truncated_ellipsoid
 from emulator.scenes import Scene
+from emulator.scenes.fibre_rules import Helix
 from emulator.training import recipe, train
 
 HERE = Path(__file__).parent
@@ -41,7 +41,7 @@ def ventricle(name: str) -> Scene:
     """The built-in scene on the mesh and fibres of ``name``."""
     wall, mesh_size, angles = VENTRICLES[name]
     mesh = truncated_ellipsoid(wall, *mesh_size)
-    fibres = rule_based_fibres(mesh, angles=angles)
+    fibres, _ = Helix(angles).directions(mesh)
     scene = em.scenes.left_ventricle(order=1)
     return replace(scene, name=name, mesh=mesh, fibres=fibres, origin={})
 

@@ -30,10 +30,10 @@ from calibrate.figures import COLOURS, pyplot
 from calibrate.measurements import CavityVolume, Observations, landmarks, spread_landmarks
 from calibrate.samplers import NUTSOptions
 from emulator.fem import Simulator, run_campaign
-from emulator.geometry.fibres import rule_based_fibres
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene
 from emulator.scenes.built_in.ventricles import HELIX, PRESSURE
+from emulator.scenes.fibre_rules import Helix
 
 HERE = Path(__file__).parent
 SEED = 17
@@ -115,7 +115,7 @@ def of_another_law(scene: Scene) -> Scene:
 
 def of_other_fibres(scene: Scene) -> Scene:
     """Fibres turned by 15 degrees throughout: 75 to -45 in place of 60 to -60."""
-    fibres = rule_based_fibres(scene.mesh, angles=(HELIX[0] + 15.0, HELIX[1] + 15.0))
+    fibres, _ = Helix((HELIX[0] + 15.0, HELIX[1] + 15.0)).directions(scene.mesh)
     return replace(scene, fibres=fibres, origin={})
 
 

@@ -18,7 +18,7 @@ from plotly.offline import get_plotlyjs
 from calibrate.local_server import Handler, Server, listen
 from calibrate.measurements.klotz import klotz_of
 from calibrate.measurements.volume import PressureVolume, pressure_volume
-from emulator.accuracy.estimate import error_bar
+from emulator.accuracy.estimate import ErrorBar
 from emulator.core.errors import InputError
 from emulator.fem import Simulator, Status
 from emulator.geometry.facets import Cavity, surface_mesh
@@ -152,7 +152,7 @@ class Explorer:
 
     @cached_property
     def _bar(self) -> Any:
-        return error_bar(self._forward, self._simulator)
+        return ErrorBar(self._forward, self._simulator)
 
     @cached_property
     def _fast(self) -> Any:

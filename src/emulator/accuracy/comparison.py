@@ -115,12 +115,8 @@ class Errors:
 def case_errors(forward: ForwardMap, thetas: jax.Array, reference: jax.Array) -> Errors:
     """Return the errors of ``forward`` at ``thetas`` (c, p) against ``reference`` (c, n, 3).
 
-    Raises
-    ------
-    InputError
-        The map does not return all nodes, or a load of the scene has no potential.
-    SolverError
-        The map has no valid prediction for any case.
+    :class:`InputError` for a map over some nodes, or a load without a potential;
+    :class:`SolverError` where the map has no valid prediction for any case.
     """
     scene = forward.scene
     if len(forward.nodes) != len(scene.mesh.nodes):

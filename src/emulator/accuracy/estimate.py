@@ -45,30 +45,36 @@ words.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.accuracy.distance import (
-    LARGEST_U,
-    Distance,
-    guarded_distance,
-    newton_distance,
-    valid_state,
-)
 from emulator.core.errors import InputError
 from emulator.fem.assembly import System
-from emulator.fem.compiled import compiled, cond
-from emulator.fem.energy import at_points, displacement_gradient, require_shape
+from emulator.fem.compiled import compiled, cond, is_traced, while_loop
+from emulator.fem.energy import at_points, displacement_gradient, require_shape, volume_ratio
+from emulator.fem.formulations.displacement import UNBALANCED
+from emulator.fem.linear import Outcome
+from emulator.fem.load_stepping import LoadStepping
 from emulator.fem.simulator import Simulator
+from emulator.fem.solution import NewtonState, Status
 from emulator.mechanics.kinematics import Barriers, Strain
 from emulator.scenes.scene import Scene
 from emulator.scenes.tissue import Tissue
 from emulator.surrogates.protocol import ForwardMap
+
+LARGEST_U = 1e100  # mm; larger displacements count as not finite: J, their cube, would overflow
+# Largest contraction of an accepted step (docs/experiments.md, "An error bar from the forces out of
+# balance").
+_CONTRACTION = 0.25
+_LEAST_SHARE = 0.2  # least share of the smallest J after a step or in a replacement state
+_ROUND_OFF = 1e-9  # errors below this fraction of the displacement are round-off: not checked
+_GOOD_STEP = 0.1  # the iteration stops only after a step that leaves at most this much residual
+_MOST_ITERATIONS = 30
+_FRACTIONS = (1.0, 0.9, 0.75, 0.5, 0.25, 0.1, 0.0)  # along the line from the centre's solution
 
 
 class Guard(NamedTuple):
@@ -100,12 +106,16 @@ class Guard(NamedTuple):
 
     def sentence(self, scene: Scene) -> str:
         """Return all reasons not to trust the prediction, in words; empty when there are none."""
+        faults = [
+            f"parameter '{p.name}' is {float(value):g} {p.unit}".rstrip()
+            + f", outside {p.low:g} to {p.high:g}"
+            for p, value, out in zip(scene.parameters, self.theta, self.outside, strict=True)
+            if out
+        ]
         if not self.finite:
-            faults = [] if np.isfinite(self.theta).all() else ["theta is not finite"]
-            return "; ".join(
-                [*self._outside_range(scene), *faults, "the prediction is not finite"][:2]
-            )
-        faults = self._outside_range(scene)
+            if not np.isfinite(self.theta).all():
+                faults.append("theta is not finite")
+            return "; ".join([*faults, "the prediction is not finite"][:2])
         if self.least_J <= 0.0:
             faults.append(f"an element is inverted (least J = {float(self.least_J):.3g})")
         elif self.barrier:
@@ -116,15 +126,6 @@ class Guard(NamedTuple):
             faults.append("no equilibrium was found near it")
         return "; ".join(faults)
 
-    def _outside_range(self, scene: Scene) -> list[str]:
-        """Name each parameter outside its range, with its value and the range."""
-        return [
-            f"parameter '{p.name}' is {float(value):g} {p.unit}".rstrip()
-            + f", outside {p.low:g} to {p.high:g}"
-            for p, value, out in zip(scene.parameters, self.theta, self.outside, strict=True)
-            if out
-        ]
-
 
 def guard(scene: Scene, theta: jax.Array, u: jax.Array) -> Guard:
     """Check theta (p,) and the prediction ``u`` (n, 3) mm alone; nothing is factorised."""
@@ -133,24 +134,17 @@ def guard(scene: Scene, theta: jax.Array, u: jax.Array) -> Guard:
     limits = Barriers()
     active = jnp.any(limits.J_start > J) | jnp.any(limits.I1_start < I1)
     no = jnp.array(False)
+    # Each entry of theta with all others at the centre of the box; NaN is outside.
+    each = jnp.where(jnp.eye(len(scene.parameters), dtype=bool), theta[None, :], scene.centre)
     return Guard(
         theta=theta,
-        outside=outside_box(scene, theta),
+        outside=~scene.space.contains(each),
         finite=finite,
         least_J=jnp.min(J),
         barrier=active | jnp.any(I4f > limits.I4f_start),
         indefinite=no,
         unsettled=no,
     )
-
-
-def outside_box(scene: Scene, theta: jax.Array) -> jax.Array:
-    """Return which entries of ``theta`` (p,) lie outside their range, (p,) bool; NaN does.
-
-    Each entry is tested with all other entries at the centre of the box.
-    """
-    each = jnp.where(jnp.eye(len(scene.parameters), dtype=bool), theta[None, :], scene.centre)
-    return ~scene.space.contains(each)
 
 
 def invariants(
@@ -172,8 +166,110 @@ def invariants(
         isochoric = 1.0 + strain.isochoric_I4f_minus_1
         return J, I1, jnp.fmax(jnp.vdot(fibre, fibre), isochoric)
 
-    J, I1, I4f = at_points(measures, displacement_gradient(scene, u), scene.tissue_at(theta))
-    return J, I1, I4f
+    return at_points(measures, displacement_gradient(scene, u), scene.tissue_at(theta))
+
+
+class Distance(NamedTuple):
+    """The distance of a field from equilibrium, by one of the two methods.
+
+    error : the field less the equilibrium, (n, 3) mm.
+    gap : the field's potential energy less the equilibrium's, () mN mm.
+    contraction : the estimated relative error of ``error``, ().
+    iterations : the number of FEM iterations, ().
+    indefinite : whether the tangent is known to be indefinite, ().
+    accepted : whether the method's own check accepts the result, ().
+    """
+
+    error: jax.Array
+    gap: jax.Array
+    contraction: jax.Array
+    iterations: jax.Array
+    indefinite: jax.Array
+    accepted: jax.Array
+
+
+def _least_J(scene: Scene, u: jax.Array) -> jax.Array:
+    return jnp.min(volume_ratio(scene, u))
+
+
+def _norm(field: jax.Array) -> jax.Array:
+    return jnp.sqrt(jnp.sum(field**2))
+
+
+def valid_state(
+    scene: Scene, centre: jax.Array, u: jax.Array, theta: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Return ``u`` (n, 3) and ``theta`` (p,), changed where the energy has no tangent.
+
+    ``u`` is put on its supports and, if an element is inverted, moved towards ``centre``, the
+    solution (n, 3) at the centre of the box, until none is. Entries of theta that are not finite
+    are replaced by the centre's.
+    """
+    finite = jnp.all(jnp.abs(u) < LARGEST_U)
+    theta = jnp.where(jnp.isfinite(theta), theta, scene.centre)
+    supported = scene.on_supports(jnp.where(finite, u, centre), theta)
+    fractions = jnp.array(_FRACTIONS)[:, None, None]
+    states = jnp.where(fractions == 1.0, supported, centre + fractions * (supported - centre))
+    J = jax.vmap(partial(_least_J, scene))(states)
+    # The prediction need only have J > 0; a replacement must keep J well above 0.
+    valid = (_LEAST_SHARE * J[-1] < J).at[0].set(J[0] > 0.0)
+    return states[jnp.argmax(valid)], theta
+
+
+def newton_distance(system: System, u: jax.Array, theta: jax.Array) -> Distance:
+    """Take Newton's step with the opposite sign, and check it by one more back-substitution."""
+    residual, _, relative = system.balance(u, theta)
+    tangent = system.tangent(u, theta)
+    values = system.pattern.safe_values(tangent)
+    step, outcome = system.attempt(values, residual)
+    error = system.extend(step)
+    corrected = u - error
+    upright = _least_J(system.scene, corrected) > _LEAST_SHARE * _least_J(system.scene, u)
+    remainder = system.residual(jnp.where(upright, corrected, u), theta)
+    length = _norm(error)
+    contraction = _norm(system.attempt(values, remainder)[0]) / jnp.where(length > 0, length, 1.0)
+    gap = 0.5 * jnp.vdot(residual, system.restrict(error))
+    valid = system.pattern.solvable(tangent) & jnp.isfinite(length) & upright & (gap >= 0.0)
+    exact = length <= _ROUND_OFF * _norm(u)
+    # Strains that hardly balance any load are due to the error, and so is their stiffness.
+    contracts = (contraction <= _CONTRACTION) & (relative <= UNBALANCED)
+    return Distance(
+        error=error,
+        gap=gap,
+        contraction=jnp.where(exact, jnp.minimum(contraction, 1.0), contraction),
+        iterations=jnp.array(0),
+        indefinite=(outcome == Outcome.INDEFINITE) | (gap < 0.0),
+        accepted=valid & (exact | contracts),
+    )
+
+
+def guarded_distance(simulator: Simulator, u: jax.Array, theta: jax.Array) -> Distance:
+    """Iterate by FEM from ``u`` until steps are short beside the distance covered; return it."""
+    system = simulator.system
+    stepping = LoadStepping(system, simulator.options, theta)
+
+    def advance(carry: tuple[NewtonState, jax.Array, jax.Array]):  # noqa: ANN202
+        state, _, _ = carry
+        next_state = stepping.step(state)
+        way, step = _norm(next_state.u - u), _norm(next_state.u - state.u)
+        # A shortened step is small too, but leaves most of its residual.
+        short = (step <= _CONTRACTION * way) & (next_state.load >= 1.0)
+        short &= next_state.relative_residual <= _GOOD_STEP * state.relative_residual
+        finished = short | (next_state.status == Status.CONVERGED)
+        return next_state, finished, step / jnp.where(way > 0, way, 1.0)
+
+    def unfinished(carry: tuple[NewtonState, jax.Array, jax.Array]) -> jax.Array:
+        state, finished, _ = carry
+        running = (state.status == Status.RUNNING) & (state.load >= 1.0)
+        return running & ~finished & (state.iterations < _MOST_ITERATIONS)
+
+    start = stepping.begin(u)
+    converged = start.status == Status.CONVERGED
+    state, finished, ratio = while_loop(unfinished, advance, (start, converged, jnp.array(0.0)))
+    follower = system.follower_force(u, theta)
+    gap = system.potential(u, theta, 1.0, follower)[0]
+    gap = gap - system.potential(state.u, theta, 1.0, follower)[0]
+    return Distance(u - state.u, gap, ratio, state.iterations, jnp.array(False), finished)
 
 
 class ErrorEstimate(NamedTuple):
@@ -213,28 +309,36 @@ class ErrorEstimate(NamedTuple):
         return jax.jvp(quantity, (self.displacement,), (self.field,))[1]
 
 
-@dataclass(frozen=True, eq=False)
 class ErrorBar:
-    """Error estimates of ``forward``; made by :func:`error_bar`.
+    """Error estimates of ``forward``, a map over all nodes; one solve, at the centre of the box.
+
+    :class:`InputError` for a map over some nodes, or of another scene than the simulator's;
+    :class:`SolverError` where there is no solution at the centre.
 
     centre : the FEM solution at the centre of the box, (n, 3) mm.
     """
 
-    forward: ForwardMap
-    simulator: Simulator
-    centre: jax.Array
-
-    @property
-    def scene(self) -> Scene:
-        """The scene of the forward map."""
-        return self.forward.scene
+    def __init__(self, forward: ForwardMap, simulator: Simulator) -> None:
+        self.forward, self.scene = forward, forward.scene
+        if len(forward.nodes) != len(self.scene.mesh.nodes):
+            raise InputError("an error bar needs a forward map over all nodes")
+        if self.scene.fingerprint != simulator.scene.fingerprint:
+            raise InputError(
+                f"error bar: the map is of scene '{self.scene.name}' ({self.scene.fingerprint}), "
+                f"the simulator of '{simulator.scene.name}' ({simulator.scene.fingerprint})"
+            )
+        self.centre = simulator(self.scene.centre)
+        self._forward = jax.jit(lambda theta: forward(theta))
+        self._prepare = compiled(partial(valid_state, self.scene, self.centre))
+        self._step = compiled(partial(newton_distance, simulator.system))
+        self._by_fem = compiled(partial(guarded_distance, simulator))
+        self._finish = compiled(partial(_report, simulator.system, self.centre))
 
     def __call__(self, theta: jax.Array) -> ErrorEstimate:
         """Estimate the error of the forward map at ``theta`` (p,), inside the box or not."""
         theta = jnp.asarray(theta, dtype=float)
         require_shape(self.scene, "theta", theta, (len(self.scene.parameters),))
-        traced = isinstance(theta, jax.core.Tracer)
-        return self.of_field(self.forward(theta) if traced else self._forward(theta), theta)
+        return self.of_field((self.forward if is_traced(theta) else self._forward)(theta), theta)
 
     def of_field(self, u: jax.Array, theta: jax.Array) -> ErrorEstimate:
         """Estimate the error of any displacement ``u`` (n, 3) mm as a prediction at ``theta``."""
@@ -242,61 +346,13 @@ class ErrorBar:
         require_shape(self.scene, "theta", theta, (len(self.scene.parameters),))
         require_shape(self.scene, "displacement", u, self.scene.held.shape)
         state, safe_theta = self._prepare(u, theta)
-        return self._finish(u, theta, state, self._distance(state, safe_theta))
-
-    def _distance(self, state: jax.Array, theta: jax.Array) -> Distance:
-        """Return the distance of a valid state; by FEM's iteration where one step is rejected."""
-        step = self._step(state, theta)
-        return cond(
+        step = self._step(state, safe_theta)
+        distance = cond(
             step.accepted,
             lambda: step,
-            lambda: self._error_by_fem(state, theta)._replace(indefinite=step.indefinite),
+            lambda: self._by_fem(state, safe_theta)._replace(indefinite=step.indefinite),
         )
-
-    # ---- compiled parts ------------------------------------------------------------------------
-    @cached_property
-    def _forward(self):  # noqa: ANN202 - jitted closures, private
-        return jax.jit(lambda theta: self.forward(theta))
-
-    @cached_property
-    def _prepare(self):  # noqa: ANN202
-        return compiled(partial(valid_state, self.scene, self.centre))
-
-    @cached_property
-    def _step(self):  # noqa: ANN202
-        return compiled(partial(newton_distance, self.simulator.system))
-
-    @cached_property
-    def _error_by_fem(self):  # noqa: ANN202
-        return compiled(partial(guarded_distance, self.simulator))
-
-    @cached_property
-    def _finish(self):  # noqa: ANN202
-        return compiled(partial(_report, self.simulator.system, self.centre))
-
-
-def error_bar(
-    forward: ForwardMap,
-    simulator: Simulator,
-) -> ErrorBar:
-    """Make error estimates of ``forward``, a map over all nodes; solve once, at the box's centre.
-
-    Raises
-    ------
-    InputError
-        A map over some nodes only, or of another scene than the simulator's.
-    SolverError
-        No solution at the centre of the box.
-    """
-    scene = forward.scene
-    if len(forward.nodes) != len(scene.mesh.nodes):
-        raise InputError("an error bar needs a forward map over all nodes")
-    if scene.fingerprint != simulator.scene.fingerprint:
-        raise InputError(
-            f"error bar: the map is of scene '{scene.name}' ({scene.fingerprint}), the simulator "
-            f"of '{simulator.scene.name}' ({simulator.scene.fingerprint})"
-        )
-    return ErrorBar(forward, simulator, simulator(scene.centre))
+        return self._finish(u, theta, state, distance)
 
 
 def _report(

@@ -11,7 +11,7 @@ nearly all of it. So the difference has an effectivity of one half to one.
 
 No solve from rest is needed. The iteration on the finer mesh starts from the prolonged solution,
 plus the difference found at another theta. A Newton step is checked by a second back-substitution
-(:func:`emulator.accuracy.distance.newton_distance`), and another step follows if the second is not
+(:func:`emulator.accuracy.estimate.newton_distance`), and another step follows if the second is not
 much shorter. Where steps do not contract, as for locked elements far from any known theta, FEM
 solves on the finer mesh.
 """
@@ -26,9 +26,8 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from emulator.accuracy.distance import Distance, newton_distance
+from emulator.accuracy.estimate import Distance, newton_distance
 from emulator.core.errors import InputError
 from emulator.fem.compiled import compiled
 from emulator.fem.linear.suitesparse import free_factors
@@ -113,9 +112,10 @@ class MeshError:
         theta = jnp.asarray(theta, dtype=float)
         what = "the error of the mesh"
         coarse = self.simulator.solve(theta, start).require_converged(what).displacement
-        begin = self._prolong(coarse)
+        prolong = self.finer.refinement.carry
+        begin = jnp.asarray(prolong(coarse))
         if neighbour is not None:
-            begin = begin + neighbour.fine - self._prolong(neighbour.coarse)
+            begin = begin + neighbour.fine - jnp.asarray(prolong(neighbour.coarse))
         # A step solves one set of equations; a scene whose mesh is the loaded shape has two.
         fine_by_steps = None if self.fine.scene.loaded_by else self._fine_by_steps(theta, begin)
         if fine_by_steps is not None:
@@ -130,9 +130,6 @@ class MeshError:
     def forget(self) -> None:
         """Free all factors that are kept: a large mesh's are gigabytes, and would stay."""
         free_factors()
-
-    def _prolong(self, u: jax.Array) -> jax.Array:
-        return jnp.asarray(self.finer.refinement.carry(np.asarray(u)))
 
     @cached_property
     def _step(self) -> Callable[[jax.Array, jax.Array], Distance]:

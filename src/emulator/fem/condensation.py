@@ -1,6 +1,7 @@
 r"""Static condensation of mean dilatation: the volume and pressure of each block are eliminated.
 
-A block is a quadratic element, or a patch of linear ones (:mod:`emulator.geometry.patches`).
+A block is a quadratic element, or a patch of linear ones
+(:class:`~emulator.geometry.discretisation.Patches`).
 
 With displacements alone, a stiff volume term limits Newton's steps to where the constraint is
 nearly linear: hundreds of tiny steps at nu = 0.4999 (docs/experiments.md, "Mean dilatation on the

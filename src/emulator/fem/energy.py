@@ -15,8 +15,8 @@ With mean dilatation the law sees the mean volume ratio of the element,
 
 and W is evaluated at :math:`\hat F`: one volume constraint an element, which quadratic tetrahedra
 can meet without locking (Simo, Taylor & Pister 1985). With patch dilatation the mean is taken over
-a patch of linear tetrahedra (:mod:`emulator.geometry.patches`). A *block* shares one mean: an
-element, or a patch.
+a patch of linear tetrahedra (:class:`~emulator.geometry.discretisation.Patches`). A *block* shares
+one mean: an element, or a patch.
 """
 
 from __future__ import annotations

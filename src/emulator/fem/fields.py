@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.fem.energy import at_points, displacement_gradient, energy_of_gradient, point_energy
+from emulator.fem.energy import at_points, displacement_gradient, energy_of_gradient
 from emulator.geometry.fibres import unit
 from emulator.mechanics.kinematics import determinant
 
@@ -66,8 +66,6 @@ def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np
 
 def _first_piola(scene: Scene, H: jax.Array, theta: jax.Array) -> jax.Array:
     """Return the first Piola-Kirchhoff stress (m, q, 3, 3) in kPa of the strain energy."""
-    if scene.dilatation == "pointwise":
-        return at_points(jax.grad(point_energy(scene, theta)), H, scene.tissue_at(theta))
     slope = jax.grad(energy_of_gradient, argnums=1)(scene, H, theta)
     return slope / scene.discretisation.weights[..., None, None]
 

@@ -27,12 +27,10 @@ from functools import cached_property
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import FacetRule, facet_rule
-from emulator.geometry.mesh import Mesh
+from emulator.geometry.mesh import SIDES, Mesh, cross_sides, parts, unshared
 
 # Nodes of a quadratic facet (corners, then middles of edges 01, 12, 20) as four flat triangles.
 _QUARTERS = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
@@ -71,8 +69,7 @@ def cone_volume[A: (jax.Array, np.ndarray)](x: A) -> A:
 
 def mean_normal(corners: np.ndarray) -> np.ndarray:
     """Return the unit normal (3,) of all facets ``corners`` (k, 3 or 6, 3) together."""
-    u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    normal = np.cross(u, v).sum(axis=0)
+    normal = cross_sides(corners).sum(axis=0)
     return normal / np.linalg.norm(normal)
 
 
@@ -89,55 +86,47 @@ def surface_mesh(facets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def rim(facets: np.ndarray) -> np.ndarray:
     """Return the edges of one facet only, oriented along it: (e, 2), or (e, 3) with midpoints."""
-    sides = [[0, 1], [1, 2], [2, 0]] if facets.shape[1] == 3 else [[0, 1, 3], [1, 2, 4], [2, 0, 5]]
-    edges = np.concatenate([facets[:, side] for side in sides])
-    _, first, counts = np.unique(
-        np.sort(edges[:, :2], axis=1), axis=0, return_index=True, return_counts=True
-    )
-    return edges[first[counts == 1]]
+    width = 2 if facets.shape[1] == 3 else 3
+    sides = [(*side, 3 + k)[:width] for k, side in enumerate(SIDES)]
+    return unshared(np.concatenate([facets[:, side] for side in sides]), 2)
 
 
 def openings(facets: np.ndarray) -> list[np.ndarray]:
     """Return the rim edges of ``facets``, one array (e, 2 or 3) for each opening."""
     edges = rim(facets)
-    if not len(edges):
-        return []
-    names, ends = np.unique(edges[:, :2], return_inverse=True)
-    start, end = ends.reshape(-1, 2).T
-    graph = coo_array((np.ones(len(edges)), (start, end)), shape=(len(names),) * 2)
-    count, label = connected_components(graph, directed=False)
-    return [edges[label[start] == k] for k in range(count)]
+    nodes, ends = np.unique(edges[:, :2], return_inverse=True)
+    ends = ends.reshape(-1, 2)
+    label = parts(ends, len(nodes))
+    return [edges[label[ends[:, 0]] == k] for k in np.unique(label)]
 
 
 def enclosed_volume[A: (jax.Array, np.ndarray)](facets: np.ndarray) -> Callable[[A], A]:
-    r"""Return ``x -> V`` in mm3, the volume within ``facets`` (k, 3 or 6) and lids on openings.
+    """Return ``x -> V``, the volume (...) mm3 within ``facets`` (k, 3 or 6) and lids on openings.
 
-    .. math:: V = \frac13 \oint x \cdot n \, da
-
-    by the divergence theorem, with ``n`` the facets' own normals: positive where they point out of
-    the enclosed space. The lid of an opening is a fan from the mean of its rim's corners; ``x`` is
-    (n, 3) in mm.
+    It is positive where the facets' own normals point out of the enclosed space. The lid of an
+    opening is a fan from the mean of its rim's corners; ``x`` is (..., n, 3) in mm.
     """
     rims = [(edges, np.unique(edges[:, :2])) for edges in openings(facets)]
 
     def volume(x: A) -> A:
-        total = cone_volume(x[facets]).sum()
+        total = cone_volume(x[..., facets, :]).sum(-1)
         for edges, ends in rims:
-            total = total + cone_volume(_lids(x[edges], x[ends].mean(axis=0))).sum()
+            lids = _lids(x[..., edges, :], x[..., ends, :].mean(-2))
+            total = total + cone_volume(lids).sum(-1)
         return total
 
     return volume
 
 
 def _lids[A: (jax.Array, np.ndarray)](edges: A, middle: A) -> A:
-    """Return facets between rim edges (e, 2 or 3, 3) and ``middle`` (3,), opposite to the wall."""
+    """Return facets between rim edges (..., e, 2 or 3, 3) and ``middle`` (..., 3), facing in."""
     xp = edges.__array_namespace__()
-    start, end = edges[:, 0], edges[:, 1]
-    middle = xp.broadcast_to(middle, start.shape)
-    if edges.shape[1] == 2:
-        return xp.stack([end, start, middle], axis=1)
-    to, back = 0.5 * (start + middle), 0.5 * (middle + end)
-    return xp.stack([end, start, middle, edges[:, 2], to, back], axis=1)
+    start, end = edges[..., 0, :], edges[..., 1, :]
+    middle = xp.broadcast_to(middle[..., None, :], start.shape)
+    corners = [end, start, middle]
+    if edges.shape[-2] == 3:
+        corners += [edges[..., 2, :], 0.5 * (start + middle), 0.5 * (middle + end)]
+    return xp.stack(corners, axis=-2)
 
 
 MM3_PER_ML = 1000.0
@@ -181,11 +170,7 @@ class Cavity:
 
         Differentiable; ``displacement[..., cavity.nodes, :]`` restricts a full field.
         """
-
-        def one(u: jax.Array) -> jax.Array:
-            return self._factor * self._volume(self._X + u)
-
-        return jnp.vectorize(one, signature="(k,d)->()")(jnp.asarray(displacement))
+        return self._factor * self._volume(self._X + jnp.asarray(displacement))
 
     @cached_property
     def rest(self) -> float:

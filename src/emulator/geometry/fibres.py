@@ -72,12 +72,9 @@ def of_elements(directions: np.ndarray) -> np.ndarray:
 
 
 def from_nodes(mesh: Mesh, at_nodes: np.ndarray, order: int) -> np.ndarray:
-    """Return unit directions (m, q, 3) at the quadrature points of elements of ``order``.
+    """Return unit directions (m, q, 3) at the points of elements of ``order`` from (n, 3) at nodes.
 
-    Parameters
-    ----------
-    mesh : linear or quadratic; ``order`` may be higher, for a mesh that is made quadratic.
-    at_nodes : the directions (n, 3) at its nodes.
+    ``order`` may be higher than the mesh's, which is about to be made quadratic.
     """
     local = at_nodes[mesh.elements]
     side = np.where(np.einsum("mai,mi->ma", local, local[:, 0]) < 0.0, -1.0, 1.0)
@@ -99,10 +96,13 @@ def from_elements(mesh: Mesh, directions: np.ndarray) -> np.ndarray:
     alike_pairs = (one != other) & (np.abs(cosine) > _ALIKE)
     one, other, side = one[alike_pairs], other[alike_pairs], np.sign(cosine[alike_pairs])
     step = centre[other] - centre[one]
-    weight = 1.0 / np.sum(step**2, axis=1)
+    weight = 1.0 / np.sum(step**2, axis=1)[:, None, None]
     change = side[:, None] * directions[other] - directions[one]
-    gram = _sum_rows(one, weight[:, None, None] * step[:, :, None] * step[:, None, :], count)
-    moment = _sum_rows(one, weight[:, None, None] * step[:, :, None] * change[:, None, :], count)
+    of_row = csr_matrix((np.ones(len(one)), (one, np.arange(len(one)))), (count, len(one)))
+    gram, moment = (
+        (of_row @ (weight * step[:, :, None] * each[:, None]).reshape(-1, 9)).reshape(-1, 3, 3)
+        for each in (step, change)
+    )
     damping = _DAMPING * np.maximum(np.trace(gram, axis1=1, axis2=2), 1e-300)
     gram = gram + damping[:, None, None] * np.eye(3)
     slope = np.linalg.solve(gram, moment)  # by NumPy, because JAX's batched LAPACK is avoided
@@ -111,12 +111,6 @@ def from_elements(mesh: Mesh, directions: np.ndarray) -> np.ndarray:
     # Slopes that turn a direction by more than its neighbours differ are discarded.
     alike = np.einsum("mqi,mi->mq", at_points, directions) > _ALIKE
     return np.where(alike[:, :, None], at_points, directions[:, None])
-
-
-def _sum_rows(rows: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
-    """Return the sums (count, 3, 3) of ``values`` (k, 3, 3) by row."""
-    flat = values.reshape(len(values), 9)
-    return np.stack([np.bincount(rows, each, count) for each in flat.T], axis=1).reshape(-1, 3, 3)
 
 
 def check_across(sheets: np.ndarray, fibres: np.ndarray) -> None:
@@ -129,10 +123,7 @@ def check_across(sheets: np.ndarray, fibres: np.ndarray) -> None:
 def checked_directions(vectors: np.ndarray, mesh: Mesh, kind: str) -> np.ndarray:
     """Return unit vectors (m, q, 3), or (m, 3), of each element of ``mesh``, frozen.
 
-    Raises
-    ------
-    InputError
-        Another shape, or no unit vectors; ``kind`` says of what.
+    :class:`InputError` for another shape, or no unit vectors; ``kind`` says of what.
     """
     frozen = frozen_array(vectors)
     count, points = len(mesh.elements), len(quadrature_points(mesh.order))
@@ -149,13 +140,6 @@ Angles = tuple[float, float]
 Axis = tuple[float, float, float]
 
 
-class Directions(NamedTuple):
-    """Unit vectors at the quadrature points, (m, 3) or (m, q, 3), orthogonal to one another."""
-
-    fibres: np.ndarray
-    sheets: np.ndarray
-
-
 class Depth(NamedTuple):
     """Depth in a wall at the quadrature points, (m,) or (m, q), or at the nodes, (n,).
 
@@ -164,43 +148,6 @@ class Depth(NamedTuple):
 
     value: np.ndarray
     normal: np.ndarray
-
-
-def rule_based_directions(
-    mesh: Mesh,
-    endocardium: str = "endocardium",
-    epicardium: str = "epicardium",
-    angles: Angles = (90.0, -90.0),
-    axis: Axis = (0.0, 0.0, 1.0),
-) -> Directions:
-    """Return the fibres, and the sheets along the transmural direction.
-
-    Parameters
-    ----------
-    mesh : any ventricle, linear or quadratic.
-    endocardium, epicardium : facet sets.
-    angles : helix angle in degrees on the endocardium and on the epicardium.
-    axis : from apex to base, any length.
-    """
-    return turned(wall_depth(mesh, (endocardium,), (epicardium,)), angles, axis)
-
-
-def rule_based_fibres(
-    mesh: Mesh,
-    endocardium: str = "endocardium",
-    epicardium: str = "epicardium",
-    angles: Angles = (90.0, -90.0),
-    axis: Axis = (0.0, 0.0, 1.0),
-) -> np.ndarray:
-    """Return the fibres of :func:`rule_based_directions`, (m, 3) or (m, q, 3)."""
-    return rule_based_directions(mesh, endocardium, epicardium, angles, axis).fibres
-
-
-def biventricular_directions(
-    mesh: Mesh, angles: Angles = (90.0, -90.0), axis: Axis = (0.0, 0.0, 1.0)
-) -> Directions:
-    """Return the directions in two ventricles, which jump where the walls meet."""
-    return turned(biventricular_depth(mesh), angles, axis)
 
 
 def biventricular_depth(mesh: Mesh) -> Depth:
@@ -227,7 +174,10 @@ def biventricular_depth(mesh: Mesh) -> Depth:
 
 def wall_depth(mesh: Mesh, inside: tuple[str, ...], outside: tuple[str, ...]) -> Depth:
     """Return the harmonic depth, 0 on the facet sets ``inside`` and 1 on ``outside``."""
-    low, high = _nodes(mesh, inside), _nodes(mesh, outside)
+    low, high = (
+        np.unique(np.concatenate([mesh.facet_set(name) for name in names], axis=None))
+        for names in (inside, outside)
+    )
     if np.isin(low, high).any():
         between = " and ".join(f"'{name}'" for name in (*inside, *outside))
         raise InputError(f"fibres: facet sets {between} have nodes in common; there is no wall")
@@ -267,10 +217,11 @@ def _harmonic(grid: Discretisation, low: np.ndarray, high: np.ndarray) -> np.nda
 
 def turned(
     wall: Depth, angles: Angles, axis: Axis, sheet_angles: Angles = (0.0, 0.0)
-) -> Directions:
-    """Return the directions in a wall of known depth, by the rule in the module docstring.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return unit fibres and sheets in a wall of known depth, by the rule in the module docstring.
 
-    The axis may have any length.
+    angles, sheet_angles : degrees on the endocardium and on the epicardium.
+    axis : from apex to base, any length.
     """
     k = np.asarray(axis, dtype=float)
     if k.shape != (3,) or not np.isfinite(k).all() or not k.any():
@@ -279,15 +230,11 @@ def turned(
         if len(pair) != 2 or not np.isfinite(pair).all():
             raise InputError(f"fibres: angles {pair}; expected two numbers in degrees")
     n, c = wall.normal, circumferential(wall.normal, k / np.linalg.norm(k))
-    alpha, beta = (_across(wall, pair) for pair in (angles, sheet_angles))
+    (alpha, to_alpha), (beta, to_beta) = np.radians(angles), np.radians(sheet_angles)
+    depth = wall.value[..., None]
+    alpha, beta = alpha + depth * (to_alpha - alpha), beta + depth * (to_beta - beta)
     f = np.cos(alpha) * c + np.sin(alpha) * np.cross(n, c)
-    return Directions(f, np.cos(beta) * n + np.sin(beta) * np.cross(f, n))
-
-
-def _across(wall: Depth, angles: Angles) -> np.ndarray:
-    """Return the angle in radians at each depth, from one side of the wall to the other."""
-    first, last = np.radians(angles)
-    return (first + wall.value * (last - first))[..., None]
+    return f, np.cos(beta) * n + np.sin(beta) * np.cross(f, n)
 
 
 def circumferential(normals: np.ndarray, axis: np.ndarray) -> np.ndarray:
@@ -299,8 +246,3 @@ def circumferential(normals: np.ndarray, axis: np.ndarray) -> np.ndarray:
     on_axis = np.linalg.norm(across, axis=-1, keepdims=True) < 1e-8
     any_way = np.cross(normals, np.eye(3)[np.argmin(np.abs(axis))])
     return unit(np.where(on_axis, any_way, across))
-
-
-def _nodes(mesh: Mesh, names: tuple[str, ...]) -> np.ndarray:
-    """Return the nodes of facet sets."""
-    return np.unique(np.concatenate([mesh.facet_set(name) for name in names], axis=None))

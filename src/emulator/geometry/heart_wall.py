@@ -34,7 +34,7 @@ import numpy as np
 from emulator.core.errors import InputError
 from emulator.geometry.facets import MM3_PER_ML, Cavity, mean_normal
 from emulator.geometry.fibres import Axis, nodal_depth
-from emulator.geometry.mesh import Mesh, signed_volumes
+from emulator.geometry.mesh import Mesh, find_rows, signed_volumes
 
 _SMALL = 0.02  # offset of a centroid, relative to L, that makes a direction of its own
 
@@ -88,24 +88,20 @@ class Ventricle:
 def ventricle(mesh: Mesh, endocardium: str, fixed: np.ndarray) -> Ventricle:
     """Return the wall around the cavity ``endocardium``, whose nodes ``fixed`` (n,) are fixed.
 
-    Raises
-    ------
-    InputError
-        Quadratic elements; no base, or a rim of the cavity that is not in it.
+    :class:`InputError` for quadratic elements, no base, or a rim of the cavity that is not in it.
     """
     if mesh.order != 1:
         raise InputError("its elements are quadratic; expected linear tetrahedra")
     surface = mesh.surface
     base = fixed[surface].all(axis=1)
     endocardial_facets = mesh.facet_set(endocardium)
-    inner = np.zeros(len(mesh.nodes), dtype=bool)
-    inner[endocardial_facets] = True
+    nodes = np.arange(len(mesh.nodes))
+    inner = np.isin(nodes, endocardial_facets)
     rim = inner & fixed
     if not base.any() or not rim.any():
         raise InputError("it has no base: no facets held on all corners that meet the cavity")
-    outer = np.zeros(len(mesh.nodes), dtype=bool)
-    outer[surface[~base & ~_among(surface, endocardial_facets)]] = True
-    outer &= ~inner
+    outside = surface[~base & (find_rows(surface, endocardial_facets) < 0)]
+    outer = np.isin(nodes, outside) & ~inner
     if not outer.any():
         raise InputError("its surface is all cavity and base; expected an outside")
     axis = mean_normal(mesh.nodes[surface[base]])
@@ -131,12 +127,6 @@ def ventricle(mesh: Mesh, endocardium: str, fixed: np.ndarray) -> Ventricle:
         lean=centroid / np.hypot(np.linalg.norm(centroid), _SMALL),
         volume=nodal / size**3,
     )
-
-
-def _among(facets: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Return whether each of ``facets`` (k, 3) is in ``reference`` (l, 3), in any order, (k,)."""
-    keys = {tuple(each) for each in np.sort(reference, axis=1).tolist()}
-    return np.array([tuple(each) in keys for each in np.sort(facets, axis=1).tolist()])
 
 
 SEGMENTS = 17
@@ -177,11 +167,10 @@ def aha_segments(
     # From 0 at the cavity's tip to 1 at the base.
     height = np.round((centroids @ up - cavity.min()) / np.ptp(cavity), _DIGITS)
     turn = np.arctan2(centroids @ np.cross(front, up), centroids @ front) / (2.0 * np.pi)
-    labels = np.select(
-        [height >= 2.0 / 3.0, height >= 1.0 / 3.0, height >= 0.0],
-        [1 + _sector(turn, 6), 7 + _sector(turn, 6), 13 + _sector(turn, 4)],
-        SEGMENTS,
-    )
+    # The sector from 0 to 5, or from 0 to 3; 0 is centred at 0.
+    six, four = (np.floor(np.round(turn * n + 0.5, _DIGITS)).astype(int) % n for n in (6, 4))
+    thirds = [height >= 2.0 / 3.0, height >= 1.0 / 3.0, height >= 0.0]
+    labels = np.select(thirds, [1 + six, 7 + six, 13 + four], SEGMENTS)
     empty = np.setdiff1d(np.arange(1, SEGMENTS + 1), labels)
     if empty.size:
         raise InputError(
@@ -189,11 +178,6 @@ def aha_segments(
             f"{', '.join(map(str, empty))}; refine the mesh, or check the axis"
         )
     return labels
-
-
-def _sector(turn: np.ndarray, count: int) -> np.ndarray:
-    """Return the sector 0 to ``count - 1`` of each ``turn`` (m,), full turns; 0 is centred at 0."""
-    return np.floor(np.round(turn * count + 0.5, _DIGITS)).astype(int) % count
 
 
 def _unit(vector: np.ndarray, name: str, original: Axis) -> np.ndarray:

@@ -1,10 +1,16 @@
-"""Meshes in and out of files with their named sets, deformed bodies out to VTU, through meshio."""
+"""Meshes in and out of files with their named sets, deformed bodies out to VTU, through meshio.
+
+scikit-fem's, PyVista's and meshio's own meshes are recognised by their attributes; none of these
+libraries is imported for it. Gmsh, Abaqus and others store names of groups differently: meshio
+returns them as ``field_data`` with tags, ``cell_sets`` or ``point_sets``. In formats without named
+sets (VTU, XDMF) a set is an array of 0 and 1 called ``set:<name>``, on triangles or on points.
+"""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
-from contextlib import redirect_stderr, redirect_stdout
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,18 +22,24 @@ from emulator.core.errors import InputError
 from emulator.core.store import replacing
 from emulator.geometry.discretisation import quadrature_points
 from emulator.geometry.fibres import across, from_elements, from_nodes
-from emulator.geometry.foreign import MARK, as_meshio, own_node_sets, read_sets
-from emulator.geometry.mesh import Mesh, coincident, orient
+from emulator.geometry.mesh import Mesh, boundary_facets, coincident, find_rows, orient
 from emulator.geometry.refinement import to_quadratic
 
 # meshio's cells by the elements' order: (tetrahedron, triangle).
 _CELLS = {1: ("tetra", "triangle"), 2: ("tetra10", "triangle6")}
 _LOWER = {"triangle", "triangle6", "line", "line3", "vertex"}
+# VTK's numbers of cell types, and meshio's names.
+_VTK = {1: "vertex", 3: "line", 5: "triangle", 10: "tetra", 22: "triangle6", 24: "tetra10"}
+_PLURAL = {0: "points", 1: "lines", 2: "triangles"}
+_MARK = "set:"
+_TAG = "gmsh:physical"
 # A direction whose length differs from 1 by more is refused; single precision stays far below.
 _UNIT = 1e-3
 # Fibres and sheets that were interpolated are made orthogonal again, if the cosine between them is
 # below this at nine points in ten: at a jump, as between two walls, it may be anything.
 _SKEW = 0.2
+
+Sets = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +58,8 @@ class Body:
 def read_mesh(source: str | Path | Any) -> Mesh:
     """Return tetrahedra and named sets from any file meshio reads, lengths taken as mm.
 
-    Or from a mesh of scikit-fem, PyVista or meshio (:mod:`emulator.geometry.foreign`).
+    Or from a mesh of scikit-fem (its boundaries become facet sets), an ``UnstructuredGrid`` of
+    PyVista or a ``Mesh`` of meshio.
 
     Groups of triangles become facet sets and node sets, groups of lines and points node sets.
     Nodes of no tetrahedron are dropped and inverted tetrahedra are turned.
@@ -57,7 +70,8 @@ def read_mesh(source: str | Path | Any) -> Mesh:
         Missing or unreadable file, cells other than tetrahedra, a group without a name, a group
         off the surface, or a mesh :class:`Mesh` refuses.
     """
-    return _convert(source, directions=False).mesh
+    with _content(source) as content:
+        return _mesh(content)[0]
 
 
 def read_body(source: str | Path | Any, *, quadratic: bool = False) -> Body:
@@ -76,28 +90,33 @@ def read_body(source: str | Path | Any, *, quadratic: bool = False) -> Body:
     InputError
         As :func:`read_mesh`, or a direction that is not a unit vector.
     """
-    return _convert(source, directions=True, quadratic=quadratic)
+    with _content(source) as content:
+        mesh, numbers = _mesh(content)
+        order = 2 if quadratic else mesh.order
+        fibres, sheets = (
+            _directions(content, mesh, numbers, name, order) for name in ("fibres", "sheets")
+        )
+        if fibres is not None and sheets is not None and fibres.ndim == 3:
+            # Interpolation does not preserve orthogonality.
+            skew = np.quantile(np.abs(np.sum(fibres * sheets, axis=-1)), 0.9)
+            sheets = across(sheets, fibres) if skew < _SKEW else sheets
+        return Body(mesh if order == mesh.order else to_quadratic(mesh), fibres, sheets)
 
 
 def read_regions(path: str | Path, name: str) -> np.ndarray:
-    """Return the whole number (m,) of each element from cell data ``name``."""
-    content = read_cells(Path(path))
-    if name not in content.cell_data:
-        names = ", ".join(f"'{key}'" for key in content.cell_data) or "none"
-        raise InputError(f"mesh file {path}: it has no cell data '{name}' for regions; has {names}")
-    kind = _tetrahedra(content)
-    blocks = zip(content.cells, content.cell_data[name], strict=True)
-    values = np.concatenate([data for block, data in blocks if block.type == kind])
-    if values.ndim != 1 or not (values == np.round(values)).all():
-        raise InputError(f"mesh file {path}: '{name}' are not one whole number for each element")
-    return values.astype(np.int64)
+    """Return the whole number (m,) of each element of a file from its cell data ``name``."""
+    with _content(path) as content:
+        if name not in content.cell_data:
+            names = ", ".join(f"'{key}'" for key in content.cell_data) or "none"
+            raise InputError(f"it has no cell data '{name}' for regions; has {names}")
+        values = content.get_cell_data(name, _tetrahedra(content))
+        if values.ndim != 1 or not (values == np.round(values)).all():
+            raise InputError(f"'{name}' are not one whole number for each element")
+        return values.astype(np.int64)
 
 
 def write_mesh(
-    path: str | Path,
-    mesh: Mesh,
-    fibres: np.ndarray | None = None,
-    sheets: np.ndarray | None = None,
+    path: str | Path, mesh: Mesh, fibres: np.ndarray | None = None, sheets: np.ndarray | None = None
 ) -> None:
     """Write mesh, named sets and directions, to be read back by :func:`read_body`.
 
@@ -119,22 +138,28 @@ def write_mesh(
         for name, values in (("fibres", fibres), ("sheets", sheets))
         if values is not None
     }
-    _check_format(path, mesh, directions)
-    suffix = Path(path).suffix
+    file, suffix, own = f"mesh file {path}", Path(path).suffix, _own_node_sets(mesh)
+    both = next((name for name in own if name in mesh.facet_sets), None)
+    if suffix not in (".msh", ".vtu", ".xdmf"):
+        raise InputError(f"{file}: cannot write '{suffix}'; use .msh, .vtu or .xdmf")
+    if suffix == ".xdmf" and mesh.order == 2 and mesh.facet_sets:
+        raise InputError(f"{file}: .xdmf cannot hold quadratic facet sets; use .vtu")
+    if suffix == ".msh" and directions:
+        raise InputError(f"{file}: .msh cannot hold {', '.join(directions)}; use .vtu")
+    if suffix == ".msh" and both is not None:
+        raise InputError(
+            f"{file}: facet set '{both}' and node set '{both}' have different nodes; "
+            "give them different names or use .vtu"
+        )
+    options: dict[str, Any]
+    if suffix == ".msh":
+        content, options = _with_tags(mesh, own), {"file_format": "gmsh22", "binary": True}
+    else:
+        content, options = _with_marks(mesh, own, directions), {"file_format": suffix[1:]}
+        if suffix == ".xdmf":  # by default to a second file, named after the temporary one
+            options["data_format"] = "XML"
     with replacing(path) as temporary:
-        if suffix == ".msh":
-            content = _with_tags(mesh)
-            meshio.write(temporary, content, file_format="gmsh22", binary=True)
-        else:
-            # By default XDMF writes its arrays to a second file, named after the temporary one.
-            options = {"data_format": "XML"} if suffix == ".xdmf" else {}
-            content = _with_marks(mesh, directions)
-            meshio.write(temporary, content, file_format=suffix[1:], **options)
-
-
-def write_nodal(path: str | Path, mesh: Mesh, fields: Mapping[str, np.ndarray]) -> None:
-    """Write values at the nodes, (n,) by name, as VTU."""
-    _write_vtu(path, mesh, point_data=dict(fields))
+        meshio.write(temporary, content, **options)
 
 
 def write_solution(
@@ -153,10 +178,11 @@ def write_solution(
     for name, values in fields.items():
         array = np.asarray(values)
         cells[name] = [array.reshape(len(array), -1) if array.ndim == 3 else array]
-    _write_vtu(path, mesh, point_data={"displacement": np.asarray(displacement)}, cell_data=cells)
+    write_vtu(path, mesh, point_data={"displacement": np.asarray(displacement)}, cell_data=cells)
 
 
-def _write_vtu(path: str | Path, mesh: Mesh, **data: Any) -> None:
+def write_vtu(path: str | Path, mesh: Mesh, **data: Any) -> None:
+    """Write ``mesh`` with meshio's ``point_data`` and ``cell_data``, whole or not at all."""
     output = meshio.Mesh(mesh.nodes, [(_CELLS[mesh.order][0], mesh.elements)], **data)
     with replacing(path) as temporary:
         meshio.write(temporary, output, file_format="vtu")
@@ -181,31 +207,69 @@ def read_cells(path: Path) -> meshio.Mesh:
         raise InputError(f"mesh file {path} cannot be read as a mesh: {reason}") from error
 
 
-def _convert(source: str | Path | Any, *, directions: bool, quadratic: bool = False) -> Body:
+@contextmanager
+def _content(source: str | Path | Any) -> Iterator[meshio.Mesh]:
+    """Yield a file or a mesh of another library as meshio has it; errors then name the source."""
     is_file = isinstance(source, str | Path)
-    content = read_cells(Path(source)) if is_file else as_meshio(source)
+    content = read_cells(Path(source)) if is_file else _as_meshio(source)
     try:
-        mesh, numbers = _mesh(content)
-        if not directions:
-            return Body(mesh)
-        order = 2 if quadratic else mesh.order
-        fibres, sheets = (
-            _directions(content, mesh, numbers, name, order) for name in ("fibres", "sheets")
-        )
-        if fibres is not None and sheets is not None and fibres.ndim == 3:
-            # Interpolation does not preserve orthogonality.
-            skew = np.quantile(np.abs(np.sum(fibres * sheets, axis=-1)), 0.9)
-            sheets = across(sheets, fibres) if skew < _SKEW else sheets
-        return Body(mesh if order == mesh.order else to_quadratic(mesh), fibres, sheets)
+        yield content
     except InputError as error:
         name = f"mesh file {source}" if is_file else f"mesh ({type(source).__name__})"
         raise InputError(f"{name}: {str(error).removeprefix('mesh: ')}") from error
 
 
+def _as_meshio(source: Any) -> meshio.Mesh:
+    if hasattr(source, "doflocs") and hasattr(source, "boundaries"):
+        return _from_skfem(source)
+    if hasattr(source, "celltypes") and hasattr(source, "cells_dict"):
+        return _from_pyvista(source)
+    if hasattr(source, "points") and hasattr(source, "cell_sets"):
+        return source
+    raise InputError(
+        f"a {type(source).__name__} is no mesh; give a file, a scikit-fem mesh, a PyVista "
+        "UnstructuredGrid or a meshio Mesh"
+    )
+
+
+def _from_skfem(source: Any) -> meshio.Mesh:
+    points, corners = np.asarray(source.doflocs).T, np.asarray(source.t).T
+    if points.shape[1] != 3 or corners.shape[1] != 4:
+        raise InputError(f"a scikit-fem {type(source).__name__} has no tetrahedra")
+    nodes = np.asarray(source.dofs.element_dofs).T  # of MeshTet2, its nodes on edges too
+    blocks = [("tetra10" if nodes.shape[1] == 10 else "tetra", nodes)]
+    none = np.empty(0, dtype=np.int64)
+    sets = {name: [none, np.asarray(rows)] for name, rows in (source.boundaries or {}).items()}
+    if sets:
+        blocks.append(("triangle", np.asarray(source.facets).T))
+    return meshio.Mesh(points, blocks, cell_sets=sets)
+
+
+def _from_pyvista(source: Any) -> meshio.Mesh:
+    types = np.asarray(source.celltypes)
+    if unknown := sorted(set(types.tolist()) - set(_VTK)):
+        raise InputError(
+            f"the grid has cells of VTK's type {unknown[0]}; expected tetrahedra only: "
+            "grid.triangulate() splits others"
+        )
+    kinds = {int(kind): np.asarray(cells) for kind, cells in source.cells_dict.items()}
+    # PyVista's data is no mapping, but has keys.
+    of_cells, of_points = (
+        {name: np.asarray(data[name]) for name in [*data.keys()]}
+        for data in (source.cell_data, source.point_data)
+    )
+    return meshio.Mesh(
+        np.asarray(source.points),
+        [(_VTK[kind], cells) for kind, cells in kinds.items()],
+        cell_data={name: [x[types == kind] for kind in kinds] for name, x in of_cells.items()},
+        point_data=of_points,
+    )
+
+
 def _mesh(content: meshio.Mesh) -> tuple[Mesh, np.ndarray]:
     """Return the mesh, and the file's number (n,) of each of its nodes."""
     kind = _tetrahedra(content)
-    elements = np.concatenate([block.data for block in content.cells if block.type == kind])
+    elements = content.get_cells_type(kind)
     numbers, points = np.unique(elements), np.asarray(content.points, dtype=float)
     if numbers[0] < 0 or numbers[-1] >= len(points):
         return Mesh(points, elements), numbers  # raises InputError and names the range
@@ -213,7 +277,7 @@ def _mesh(content: meshio.Mesh) -> tuple[Mesh, np.ndarray]:
     number[numbers] = np.arange(len(numbers))
     nodes = points[numbers]
     elements = orient(nodes, number[elements])
-    mesh = Mesh(nodes, elements, *read_sets(content, number, elements))
+    mesh = Mesh(nodes, elements, *_sets(content, number, elements))
     pairs = coincident(nodes)
     if len(pairs):
         one, other = np.sort(numbers[pairs[0]])
@@ -228,8 +292,7 @@ def _tetrahedra(content: meshio.Mesh) -> str:
     """Return the one type of tetrahedra in the file; :class:`InputError` names any other cells."""
     kinds = sorted({block.type for block in content.cells if len(block.data)})
     solid = [kind for kind in kinds if kind in ("tetra", "tetra10")]
-    other = [kind for kind in kinds if kind not in _LOWER | {"tetra", "tetra10"}]
-    if other:
+    if other := [kind for kind in kinds if kind not in (*solid, *_LOWER)]:
         raise InputError(
             f"it has {', '.join(other)} cells; expected tetrahedra only (tetra or tetra10): "
             "mesh or split the volume into them"
@@ -248,12 +311,10 @@ def _directions(
     content: meshio.Mesh, mesh: Mesh, numbers: np.ndarray, name: str, order: int
 ) -> np.ndarray | None:
     """Return unit vectors at the elements' points from cell or point data ``name``."""
-    kind = _CELLS[mesh.order][0]
     if name in content.cell_data:
-        blocks = zip(content.cells, content.cell_data[name], strict=True)
-        values = np.concatenate([data for block, data in blocks if block.type == kind])
+        values = content.get_cell_data(name, _CELLS[mesh.order][0])
         points = len(quadrature_points(order))
-        if points > 1 and values.ndim == 2 and values.shape[1] == 3 * points:
+        if points > 1 and values.shape[1:] == (3 * points,):
             at_points = _check_lengths(values.reshape(-1, 3), name, "quadrature point")
             return at_points.reshape(-1, points, 3)
         of_elements = _check_lengths(values, name, "element")
@@ -268,7 +329,7 @@ def _directions(
 def _check_lengths(values: np.ndarray, name: str, where: str) -> np.ndarray:
     """Return vectors (k, 3) scaled to length one; refuse lengths off by more than round-off."""
     values = np.asarray(values, dtype=float)
-    if values.ndim != 2 or values.shape[1] != 3:
+    if values.shape[1:] != (3,):
         raise InputError(f"'{name}' have shape {values.shape}; expected 3 components")
     length = np.linalg.norm(values, axis=1, keepdims=True)
     wrong = np.flatnonzero(~(np.abs(length[:, 0] - 1.0) <= _UNIT))
@@ -280,65 +341,101 @@ def _check_lengths(values: np.ndarray, name: str, where: str) -> np.ndarray:
     return values / length
 
 
-def _check_format(path: str | Path, mesh: Mesh, directions: Mapping[str, np.ndarray]) -> None:
-    """Refuse data that the format cannot hold or meshio cannot read back."""
-    suffix = Path(path).suffix
-    if suffix not in (".msh", ".vtu", ".xdmf"):
-        raise InputError(f"mesh file {path}: cannot write '{suffix}'; use .msh, .vtu or .xdmf")
-    if suffix == ".xdmf" and mesh.order == 2 and mesh.facet_sets:
-        raise InputError(f"mesh file {path}: .xdmf cannot hold quadratic facet sets; use .vtu")
-    if suffix != ".msh":
-        return
-    if directions:
-        raise InputError(f"mesh file {path}: .msh cannot hold {', '.join(directions)}; use .vtu")
-    for name in own_node_sets(mesh):
-        if name in mesh.facet_sets:
+def _sets(content: meshio.Mesh, number: np.ndarray, elements: np.ndarray) -> tuple[Sets, Sets]:
+    """Return the node sets and facet sets of a file's groups; groups of volumes are left out.
+
+    number : the new number (n,) of each of the file's nodes, -1 for dropped nodes.
+    elements : (m, 4 or 10) tetrahedra in the new numbers, positively oriented.
+    """
+    triangles: dict[str, list[np.ndarray]] = {}
+    points: dict[str, list[np.ndarray]] = {}
+    for name, corners in _groups(content):
+        if corners.size:
+            of_kind = triangles if corners.shape[1] == 3 else points
+            of_kind.setdefault(name, []).append(number[corners])
+    surface = boundary_facets(elements) if triangles else np.empty((0, 3), int)
+    facet_sets = {}
+    for name, groups in triangles.items():
+        rows = np.unique(np.sort(np.concatenate(groups), axis=1), axis=0)
+        places = find_rows(rows, surface[:, :3])
+        if inside := int((places < 0).sum()):
             raise InputError(
-                f"mesh file {path}: facet set '{name}' and node set '{name}' have different nodes; "
-                "give them different names or use .vtu"
+                f"{inside} of the {len(rows)} triangles in group '{name}' are not on the "
+                "surface of the tetrahedra; a group of triangles must lie on it"
             )
+        facet_sets[name] = surface[places]
+    node_sets = {name: np.unique(rows) for name, rows in facet_sets.items()}
+    for name, groups in points.items():
+        nodes = np.unique(np.concatenate(groups, axis=None))
+        node_sets[name] = nodes[nodes >= 0]
+    return {name: nodes for name, nodes in node_sets.items() if nodes.size}, facet_sets
 
 
-def _with_tags(mesh: Mesh) -> meshio.Mesh:
+def _groups(content: meshio.Mesh) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield the name and the corners (k, 1, 2 or 3) of every group of points, lines, triangles."""
+    names = {tuple(map(int, entry)): name for name, entry in content.field_data.items()}
+    for k, block in enumerate(content.cells):
+        if block.dim == 3:
+            continue
+        corners = np.asarray(block.data)[:, : block.dim + 1]
+        for name, members in content.cell_sets.items():
+            if name != "gmsh:bounding_entities" and members[k] is not None:
+                yield name, corners[np.asarray(members[k], dtype=np.int64)]
+        for name, data in content.cell_data.items():
+            if name.startswith(_MARK):
+                yield name.removeprefix(_MARK), corners[np.flatnonzero(data[k])]
+        tags = np.asarray(content.cell_data[_TAG][k] if _TAG in content.cell_data else [])
+        for tag in np.unique(tags[tags != 0]).tolist():
+            if (tag, block.dim) not in names:
+                raise InputError(
+                    f"physical group {tag} ({_PLURAL[block.dim]}) has no name of its own; "
+                    "name it in the mesh generator ($PhysicalNames)"
+                )
+            yield names[tag, block.dim], corners[tags == tag]
+    for name, nodes in content.point_sets.items():
+        yield name, np.asarray(nodes, dtype=np.int64)[:, None]
+    for name, data in content.point_data.items():
+        if name.startswith(_MARK):
+            yield name.removeprefix(_MARK), np.flatnonzero(data)[:, None]
+
+
+def _own_node_sets(mesh: Mesh) -> Sets:
+    """Return the node sets that do not follow from the facet set of the same name."""
+    return {
+        name: nodes
+        for name, nodes in mesh.node_sets.items()
+        if not np.array_equal(np.unique(nodes), np.unique(mesh.facet_sets.get(name, ())))
+    }
+
+
+def _with_tags(mesh: Mesh, own: Sets) -> meshio.Mesh:
     """Return the sets as gmsh's physical groups; a facet or node in two sets is written twice."""
     solid, triangle = _CELLS[mesh.order]
     groups = [(2, triangle, name, rows) for name, rows in mesh.facet_sets.items()]
-    groups += [(0, "vertex", name, n[:, None]) for name, n in own_node_sets(mesh).items()]
+    groups += [(0, "vertex", name, nodes[:, None]) for name, nodes in own.items()]
     blocks = [(solid, mesh.elements), *((kind, rows) for _, kind, _, rows in groups)]
     tags = [np.full(len(rows), tag) for tag, (_, rows) in enumerate(blocks)]
-    return meshio.Mesh(
-        mesh.nodes,
-        blocks,
-        cell_data={"gmsh:physical": tags, "gmsh:geometrical": [tag + 1 for tag in tags]},
-        field_data={
-            name: np.array([tag, dimension])
-            for tag, (dimension, _, name, _) in enumerate(groups, start=1)
-        },
-    )
+    names = {name: np.array([k, dim]) for k, (dim, _, name, _) in enumerate(groups, start=1)}
+    data = {_TAG: tags, "gmsh:geometrical": [tag + 1 for tag in tags]}
+    return meshio.Mesh(mesh.nodes, blocks, cell_data=data, field_data=names)
 
 
-def _with_marks(mesh: Mesh, directions: Mapping[str, np.ndarray]) -> meshio.Mesh:
+def _with_marks(mesh: Mesh, own: Sets, directions: Sets) -> meshio.Mesh:
     """Return the sets as data of 0 and 1 on triangles and points."""
+
+    def mark(members: np.ndarray, count: int) -> np.ndarray:
+        return np.isin(np.arange(count), members).astype(np.int32)
+
     solid, triangle = _CELLS[mesh.order]
     blocks = [(solid, mesh.elements)]
-    marks: dict[str, np.ndarray] = {}
+    data = {name: [values] for name, values in directions.items()}
     if mesh.facet_sets:
-        sets = list(mesh.facet_sets.values())
-        rows, positions = np.unique(np.concatenate(sets), axis=0, return_inverse=True)
+        rows = np.unique(np.concatenate([*mesh.facet_sets.values()]), axis=0)
         blocks.append((triangle, rows))
-        ends = np.cumsum([len(facets) for facets in sets])[:-1]
-        for name, members in zip(mesh.facet_sets, np.split(positions, ends), strict=True):
-            marks[MARK + name] = np.isin(np.arange(len(rows)), members).astype(np.int32)
-    data = {name: _pad_cells(values, blocks) for name, values in directions.items()}
-    none = np.zeros(len(mesh.elements), np.int32)
-    data |= {name: [none, values] for name, values in marks.items()}
-    points = {
-        MARK + name: np.isin(np.arange(len(mesh.nodes)), nodes).astype(np.int32)
-        for name, nodes in own_node_sets(mesh).items()
-    }
+        for values in data.values():
+            values.append(np.zeros((len(rows), values[0].shape[1])))
+        none = np.zeros(len(mesh.elements), np.int32)
+        for name, facets in mesh.facet_sets.items():
+            data[_MARK + name] = [none, mark(find_rows(facets, rows), len(rows))]
+    points = {_MARK + name: mark(nodes, len(mesh.nodes)) for name, nodes in own.items()}
     return meshio.Mesh(mesh.nodes, blocks, cell_data=data, point_data=points)
-
-
-def _pad_cells(values: np.ndarray, blocks: list[tuple[str, np.ndarray]]) -> list[np.ndarray]:
-    """Return the cell data of every block: ``values`` (m, k) on the tetrahedra, zeros elsewhere."""
-    return [values, *(np.zeros((len(rows), values.shape[1])) for _, rows in blocks[1:])]

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import combinations
 from types import MappingProxyType
 
 import numpy as np
@@ -22,19 +21,12 @@ from emulator.core.errors import InputError
 
 _COINCIDENT = 1e-9  # of the body's extent, below which nodes are at the same place
 
-# Edge k carries local node 4 + k of a quadratic element.
+# Edge k of a tetrahedron carries its local node 4 + k, side k of a triangle its local node 3 + k.
 EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
-# Faces of a positively oriented tetrahedron, normals pointing out.
-FACES = ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))
-
-
-def _with_midpoints(face: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the local nodes of a quadratic face: corners, then midpoints of 01, 12 and 20."""
-    pairs = [(face[k], face[(k + 1) % 3]) for k in range(3)]
-    return face + tuple(4 + EDGES.index((min(pair), max(pair))) for pair in pairs)
-
-
-QUADRATIC_FACES = tuple(_with_midpoints(face) for face in FACES)
+SIDES = ((0, 1), (1, 2), (2, 0))
+# Faces of a positively oriented tetrahedron, normals pointing out: corners, then nodes on sides.
+FACES = ((1, 2, 3, 5, 9, 8), (0, 3, 2, 7, 9, 6), (0, 1, 3, 4, 8, 7), (0, 2, 1, 6, 5, 4))
+_SWAPPED = (0, 1, 3, 2, 4, 8, 7, 6, 5, 9)  # its nodes with corners 2 and 3 swapped
 
 
 def signed_volumes(nodes: np.ndarray, elements: np.ndarray) -> np.ndarray:
@@ -44,16 +36,37 @@ def signed_volumes(nodes: np.ndarray, elements: np.ndarray) -> np.ndarray:
     return np.einsum("mi,mi->m", a, np.cross(b, c)) / 6.0
 
 
+def cross_sides(corners: np.ndarray) -> np.ndarray:
+    """Return normals (k, 3) of facets ``corners`` (k, 3 or 6, 3), as long as twice their area."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
 def orient(nodes: np.ndarray, elements: np.ndarray) -> np.ndarray:
     """Return ``elements`` (m, 4 or 10), corners 2 and 3 swapped where the volume is negative."""
     elements = np.array(elements, dtype=np.int64)
-    swapped = [0, 1, 3, 2]
-    if elements.shape[1] == 10:
-        ends = [(swapped[a], swapped[b]) for a, b in EDGES]
-        swapped += [4 + EDGES.index((min(pair), max(pair))) for pair in ends]
     inverted = signed_volumes(nodes, elements) < 0.0
-    elements[inverted] = elements[inverted][:, swapped]
+    elements[inverted] = elements[inverted][:, _SWAPPED[: elements.shape[1]]]
     return elements
+
+
+def faces_of(elements: np.ndarray) -> np.ndarray:
+    """Return the four faces (4 m, 3 or 6) of oriented tetrahedra: all first ones, then the next."""
+    width = 3 if elements.shape[1] == 4 else 6
+    return np.concatenate([elements[:, face[:width]] for face in FACES])
+
+
+def unshared(rows: np.ndarray, corners: int) -> np.ndarray:
+    """Return the ``rows`` (k, w) whose first ``corners`` nodes are those of no other row."""
+    _, first, counts = np.unique(
+        np.sort(rows[:, :corners], axis=1), axis=0, return_index=True, return_counts=True
+    )
+    return rows[first[counts == 1]]
+
+
+def find_rows(rows: np.ndarray, table: np.ndarray) -> np.ndarray:
+    """Return the place (k,) in ``table`` (t, w) of the same nodes in any order, -1 for none."""
+    places = {tuple(row): k for k, row in enumerate(np.sort(table, axis=1).tolist())}
+    return np.array([places.get(tuple(row), -1) for row in np.sort(rows, axis=1).tolist()], int)
 
 
 def boundary_facets(elements: np.ndarray) -> np.ndarray:
@@ -61,12 +74,7 @@ def boundary_facets(elements: np.ndarray) -> np.ndarray:
 
     Quadratic ones list their corners, then the midpoints of edges 01, 12 and 20.
     """
-    local = FACES if elements.shape[1] == 4 else QUADRATIC_FACES
-    faces = np.concatenate([elements[:, face] for face in local])
-    _, first, counts = np.unique(
-        np.sort(faces[:, :3], axis=1), axis=0, return_index=True, return_counts=True
-    )
-    return faces[first[counts == 1]]
+    return unshared(faces_of(elements), 3)
 
 
 def folded(elements: np.ndarray) -> np.ndarray:
@@ -75,7 +83,7 @@ def folded(elements: np.ndarray) -> np.ndarray:
     Neighbours list their common face in opposite senses. Where a mesh is tangled they do not,
     though every element has a positive volume. Of three at one face, two are on the same side.
     """
-    faces = np.concatenate([elements[:, face] for face in FACES])
+    faces = faces_of(elements[:, :4])
     owner = np.tile(np.arange(len(elements)), len(FACES))
     a, b, c = faces.T
     sense = (a < b) ^ (b < c) ^ (a < c)  # of the permutation that sorts the corners
@@ -147,22 +155,17 @@ class Mesh:
     def __post_init__(self) -> None:
         object.__setattr__(self, "nodes", frozen_array(self.nodes))
         object.__setattr__(self, "elements", indices(self.elements, "elements"))
-        sets = {n: indices(nodes, f"node set '{n}'") for n, nodes in self.node_sets.items()}
-        object.__setattr__(self, "node_sets", MappingProxyType(sets))
-        facets = {n: indices(rows, f"facet set '{n}'") for n, rows in self.facet_sets.items()}
-        object.__setattr__(self, "facet_sets", MappingProxyType(facets))
+        for field_name, kind in (("node_sets", "node set"), ("facet_sets", "facet set")):
+            sets = {n: indices(x, f"{kind} '{n}'") for n, x in getattr(self, field_name).items()}
+            object.__setattr__(self, field_name, MappingProxyType(sets))
         self._check_shapes()
         self._check_volumes()
         self._check_facets()
 
     def _check_shapes(self) -> None:
-        if self.nodes.ndim != 2 or self.nodes.shape[1] != 3:
+        if self.nodes.shape[1:] != (3,):
             raise InputError(f"mesh: nodes have shape {self.nodes.shape}; expected (n, 3)")
-        if (
-            self.elements.ndim != 2
-            or self.elements.shape[1] not in (4, 10)
-            or not self.elements.size
-        ):
+        if self.elements.shape[1:] not in ((4,), (10,)) or not self.elements.size:
             raise InputError(
                 f"mesh: elements have shape {self.elements.shape}; expected (m, 4) or (m, 10)"
             )
@@ -202,26 +205,18 @@ class Mesh:
             )
 
     def _check_facets(self) -> None:
-        if not self.facet_sets:
-            return
-        # Sorted nodes of each surface facet -> the facet as ``surface`` lists it, facing out.
-        surface = dict(
-            zip(map(tuple, np.sort(self.surface, axis=1).tolist()), self.surface, strict=True)
-        )
         width = 3 if self.order == 1 else 6
         outward = {}
         for name, facets in self.facet_sets.items():
-            if facets.ndim != 2 or facets.shape[1:] != (width,) or not len(facets):
+            if facets.shape[1:] != (width,) or not len(facets):
                 raise InputError(
                     f"mesh: facet set '{name}' has shape {facets.shape}; not (k, {width})"
                 )
-            rows = list(map(tuple, np.sort(facets, axis=1).tolist()))
-            for row in rows:
-                if row not in surface:
-                    raise InputError(
-                        f"mesh: facet {list(row)} of set '{name}' is not on the surface"
-                    )
-            outward[name] = frozen_array([surface[row] for row in rows], np.int64)
+            places = find_rows(facets, self.surface)  # which lists each facing out
+            if (places < 0).any():
+                absent = np.sort(facets[places < 0][0]).tolist()
+                raise InputError(f"mesh: facet {absent} of set '{name}' is not on the surface")
+            outward[name] = frozen_array(self.surface[places], np.int64)
         object.__setattr__(self, "facet_sets", MappingProxyType(outward))
 
     @property
@@ -251,27 +246,24 @@ class Mesh:
 
     def node_set(self, name: str) -> np.ndarray:
         """Return the nodes (k,) in set ``name``; :class:`InputError` lists the mesh's sets."""
-        if name not in self.node_sets:
-            known = ", ".join(sorted(self.node_sets)) or "none"
-            raise InputError(f"node set '{name}' is not in the mesh; its sets: {known}")
-        return self.node_sets[name]
+        return _named(self.node_sets, "node set", name)
 
     def facet_set(self, name: str) -> np.ndarray:
         """Return the facets (k, 3 or 6) in set ``name``; :class:`InputError` lists the sets."""
-        if name not in self.facet_sets:
-            known = ", ".join(sorted(self.facet_sets)) or "none"
-            raise InputError(f"facet set '{name}' is not in the mesh; its sets: {known}")
-        return self.facet_sets[name]
+        return _named(self.facet_sets, "facet set", name)
 
     def elements_behind(self, facets: np.ndarray) -> np.ndarray:
         """Return the element (k,) that each surface facet (k, 3 or 6) belongs to."""
-        owner: dict[tuple[int, ...], int] = {}
-        for corners in combinations(range(4), 3):
-            for k, row in enumerate(np.sort(self.elements[:, corners], axis=1).tolist()):
-                owner[tuple(row)] = k
-        return np.array([owner[tuple(row)] for row in np.sort(facets[:, :3], axis=1).tolist()])
+        return find_rows(facets[:, :3], faces_of(self.corners)) % len(self.elements)
 
     def to_skfem(self) -> MeshTet:
         """Return a linear mesh for scikit-fem, whose elements keep the order of their corners."""
         self.require_linear("scikit-fem's MeshTet")
         return MeshTet(self.nodes.T.copy(), self.elements.T.copy(), sort_t=False)
+
+
+def _named(sets: Mapping[str, np.ndarray], kind: str, name: str) -> np.ndarray:
+    if name not in sets:
+        known = ", ".join(sorted(sets)) or "none"
+        raise InputError(f"{kind} '{name}' is not in the mesh; its sets: {known}")
+    return sets[name]

@@ -16,62 +16,43 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.sparse import csr_matrix, identity, vstack
 
 from emulator.core.errors import InputError
-from emulator.geometry.discretisation import (
-    from_quadrature_points,
-    quadrature_points,
-    shapes_at,
-)
+from emulator.geometry.discretisation import from_quadrature_points, quadrature_points, shapes_at
 from emulator.geometry.fibres import from_elements, unit
-from emulator.geometry.mesh import EDGES, Mesh
+from emulator.geometry.mesh import EDGES, SIDES, Mesh, boundary_facets, find_rows, orient
 
 Midpoints = Callable[[np.ndarray], np.ndarray]
 
 
 def to_quadratic(mesh: Mesh, midpoints: Midpoints | None = None) -> Mesh:
-    """Return ``mesh`` with ten nodes an element; the corners keep their numbers.
+    """Return a linear ``mesh`` with ten nodes an element; the corners keep their numbers.
 
-    Parameters
-    ----------
-    mesh : the mesh of linear tetrahedra.
+    Node sets hold an edge's node where the edge lies on the surface and joins two of the set's
+    nodes; facet sets have six nodes a facet.
+
     midpoints : ``midpoints(edges) -> (e, 3)`` places in mm of the nodes on ``edges`` (e, 2), for
         curved surfaces; halfway along each edge by default.
-
-    Returns
-    -------
-    Mesh whose node sets hold an edge's node where the edge lies on the surface and joins two of
-    the set's nodes, and whose facet sets have six nodes a facet.
     """
     if mesh.order != 1:
         raise InputError("mesh: its tetrahedra are quadratic already")
-    ends = np.sort(mesh.elements[:, EDGES], axis=2)  # (m, 6, 2)
-    edges, number = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
-    first = len(mesh.nodes)
-    midpoint_positions = mesh.nodes[edges].mean(axis=1) if midpoints is None else midpoints(edges)
-    elements = np.hstack([mesh.elements, first + number.reshape(-1, 6)])
-
-    def middle(pairs: np.ndarray) -> np.ndarray:
-        """Return the node on each edge given by its ends (..., 2)."""
-        key = edges[:, 0] * first + edges[:, 1]
-        edges_sought = np.sort(pairs, axis=-1)
-        return first + np.searchsorted(key, edges_sought[..., 0] * first + edges_sought[..., 1])
+    pairs = np.sort(mesh.elements[:, EDGES], axis=2).reshape(-1, 2)
+    edges, number = np.unique(pairs, axis=0, return_inverse=True)
+    places = mesh.nodes[edges].mean(axis=1) if midpoints is None else midpoints(edges)
+    elements = np.hstack([mesh.elements, len(mesh.nodes) + number.reshape(-1, 6)])
+    surface = boundary_facets(elements)  # in the order of the linear mesh's
 
     def grown(nodes: np.ndarray) -> np.ndarray:
-        inside = np.isin(outline, nodes).all(axis=1)
-        return np.union1d(nodes, middle(outline[inside]))
+        within = np.isin(surface[:, SIDES], nodes).all(axis=2)
+        return np.union1d(nodes, surface[:, 3:][within])
 
-    sides = [[0, 1], [1, 2], [2, 0]]
-    outline = np.unique(np.sort(mesh.surface[:, sides].reshape(-1, 2), axis=1), axis=0)
-    facets = {
-        name: np.hstack([rows, middle(rows[:, sides])]) for name, rows in mesh.facet_sets.items()
-    }
     return Mesh(
-        np.vstack([mesh.nodes, midpoint_positions]),
+        np.vstack([mesh.nodes, places]),
         elements,
         {name: grown(nodes) for name, nodes in mesh.node_sets.items()},
-        facets,
+        {name: surface[find_rows(rows, mesh.surface)] for name, rows in mesh.facet_sets.items()},
     )
 
 
@@ -111,22 +92,11 @@ _DIAGONALS = (((4, 9), (5, 6, 7, 8)), ((5, 7), (4, 6, 9, 8)), ((6, 8), (4, 5, 9,
 _FOUR = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))  # of a facet: corners, then 01, 12, 20
 # Barycentric coordinates (10, 4) of a quadratic tetrahedron's nodes.
 _NODES = np.concatenate([np.eye(4), [0.5 * (np.eye(4)[a] + np.eye(4)[b]) for a, b in EDGES]])
-
-
-def _orient_child(corners: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the local nodes of a child, the last two swapped if its volume would be negative."""
-    sides = np.diff(_NODES[list(corners), 1:], axis=0)
-    a, b, c, d = corners
-    return corners if np.linalg.det(sides) > 0.0 else (a, b, d, c)
-
-
-def _children(diagonal: tuple[int, int], ring: tuple[int, ...]) -> list[tuple[int, ...]]:
-    around = [(*diagonal, ring[k], ring[(k + 1) % 4]) for k in range(4)]
-    return [_orient_child(corners) for corners in (*_CORNERS, *around)]
-
-
 # Local nodes (3, 8, 4) of the eight children, for each diagonal.
-_EIGHT = np.array([_children(*each) for each in _DIAGONALS])
+_AROUND = [[(*ends, ring[k - 1], ring[k]) for k in (1, 2, 3, 0)] for ends, ring in _DIAGONALS]
+_EIGHT = orient(
+    _NODES[:, 1:], np.concatenate([(*_CORNERS, *around) for around in _AROUND])
+).reshape(3, 8, 4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +118,7 @@ class Refinement:
         """Elements that each coarse one has become."""
         return self.corners.shape[1]
 
-    def carry(self, u: np.ndarray) -> np.ndarray:
+    def carry(self, u: ArrayLike) -> np.ndarray:
         """Return a nodal field (n, 3) on the finer mesh, equal to the given one at every point."""
         return self.prolongation @ np.asarray(u)
 
@@ -167,25 +137,25 @@ class Refinement:
 
 def refined(mesh: Mesh) -> Refinement:
     """Return the next finer mesh: quadratic elements, or each quadratic element in eight."""
-    count = len(mesh.elements)
+    # The local nodes (m, c, 4) of the children.
     if mesh.order == 1:
-        quadratic = to_quadratic(mesh)
-        parents = corner_parents(quadratic)
-        rows = np.repeat(np.arange(len(parents)), 2)
-        halves = csr_matrix((np.full(len(rows), 0.5), (rows, parents.ravel())))
-        return Refinement(mesh, quadratic, halves, np.broadcast_to(np.eye(4), (count, 1, 4, 4)))
-    children = _EIGHT[_shortest_diagonal(mesh)]  # (m, 8, 4)
-    elements = np.take_along_axis(mesh.elements[:, None], children, axis=2)
-    facets = {name: rows[:, _FOUR].reshape(-1, 3) for name, rows in mesh.facet_sets.items()}
-    linear = Mesh(mesh.nodes, elements.reshape(-1, 4), mesh.node_sets, facets)
-    new: list[csr_matrix] = []
-
-    def midpoints(edges: np.ndarray) -> np.ndarray:
-        new.append(_middle_of(mesh, children, elements, edges))
-        return new[0] @ mesh.nodes
-
-    quadratic = to_quadratic(linear, midpoints)
-    prolongation = vstack([identity(len(mesh.nodes)), new[0]], format="csr")
+        children, linear = np.tile(np.arange(4), (len(mesh.elements), 1, 1)), mesh
+    else:
+        children = _EIGHT[_shortest_diagonal(mesh)]
+        corners = np.take_along_axis(mesh.elements[:, None], children, axis=2)
+        facets = {name: rows[:, _FOUR].reshape(-1, 3) for name, rows in mesh.facet_sets.items()}
+        linear = Mesh(mesh.nodes, corners.reshape(-1, 4), mesh.node_sets, facets)
+    # The old shape functions at the middle of each new edge, in a child that has it.
+    pairs = np.sort(linear.elements[:, EDGES], axis=2).reshape(-1, 2)
+    _, first = np.unique(pairs, axis=0, return_index=True)
+    middles = _NODES[children[:, :, EDGES].reshape(-1, 2)[first]].mean(axis=1)
+    values, _ = shapes_at(mesh.order, middles)
+    parents = mesh.elements[first // (children.shape[1] * len(EDGES))]
+    rows = np.repeat(np.arange(len(first)), values.shape[1])
+    new = csr_matrix((values.ravel(), (rows, parents.ravel())), (len(first), len(mesh.nodes)))
+    prolongation = vstack([identity(len(mesh.nodes)), new], format="csr")
+    prolongation.eliminate_zeros()
+    quadratic = to_quadratic(linear, lambda _: new @ mesh.nodes)
     return Refinement(mesh, quadratic, prolongation, _NODES[children])
 
 
@@ -193,21 +163,3 @@ def _shortest_diagonal(mesh: Mesh) -> np.ndarray:
     """Return the shortest diagonal (m,) of the inner octahedron, which gives the best shapes."""
     ends = mesh.nodes[mesh.elements[:, [diagonal for diagonal, _ in _DIAGONALS]]]
     return np.argmin(np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2), axis=1)
-
-
-def _middle_of(
-    mesh: Mesh, children: np.ndarray, elements: np.ndarray, edges: np.ndarray
-) -> csr_matrix:
-    """Return the old shape functions (e, n) at the middle of the children's ``edges`` (e, 2).
-
-    children : (m, 8, 4) local nodes. elements : (m, 8, 4) their nodes.
-    """
-    size = len(mesh.nodes)
-    pairs = np.sort(elements[:, :, EDGES], axis=-1).reshape(-1, 2)
-    keys, first = np.unique(pairs[:, 0] * size + pairs[:, 1], return_index=True)
-    places = first[np.searchsorted(keys, edges[:, 0] * size + edges[:, 1])]
-    local = children[:, :, EDGES].reshape(-1, 2)[places]
-    values, _ = shapes_at(2, _NODES[local].mean(axis=1))
-    parents = mesh.elements[places // (children.shape[1] * len(EDGES))]
-    rows = np.repeat(np.arange(len(edges)), values.shape[1])
-    return csr_matrix((values.ravel(), (rows, parents.ravel())), (len(edges), size))

@@ -30,24 +30,21 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 
 from emulator.core.errors import InputError
-from emulator.geometry.surfaces import Surface, one_rim
+from emulator.geometry.mesh import cross_sides
+from emulator.geometry.surfaces import Surface, one_rim, signed_areas
 
-_TRIANGLE, _TETRAHEDRON = 2, 4  # Gmsh's numbers of element types
+_TYPES = {3: 2, 4: 4}  # Gmsh's numbers of element types, by their corners
 
 
 def triangulate(
     loops: Sequence[np.ndarray], size: float | Callable[[float, float], float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mesh a plane region between polygons, whose corners stay the only nodes on them.
+    """Return points (n, 2) and triangles (t, 3) of a plane region between polygons.
 
-    Parameters
-    ----------
+    The polygons' corners, first and in their order, stay the only nodes on them.
+
     loops : (k, 2) corners in order, of the outer polygon and of those cut out of it.
     size : edge length inside, in the corners' unit, or a function of x and y.
-
-    Returns
-    -------
-    Points (n, 2), the loops' corners first and in their order, and triangles (t, 3).
     """
     with _model() as gmsh:
         geo, rings, first = gmsh.model.geo, [], 1
@@ -68,51 +65,57 @@ def triangulate(
             gmsh.option.setNumber("Mesh.MeshSizeMin", size)
             gmsh.option.setNumber("Mesh.MeshSizeMax", size)
         gmsh.model.mesh.generate(2)
-        return _cells(gmsh, _TRIANGLE, 3, 2)
+        places, triangles = _cells(gmsh, 3)
+        return places[:, :2], triangles
 
 
 def tetrahedralise(
     points: np.ndarray, triangles: np.ndarray, size: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mesh the space within a closed surface, whose triangles stay.
+    """Return nodes (n', 3) mm and elements (m, 4) within a closed surface, whose triangles stay.
 
-    Parameters
-    ----------
-    points, triangles : (n, 3) mm and (t, 3), in any sense.
+    points, triangles : (n, 3) mm, the first nodes in their order, and (t, 3), in any sense.
     size : longest edge aimed at inside, mm.
-
-    Returns
-    -------
-    Nodes (n', 3) mm, the surface's points first and in their order, and elements (m, 4).
     """
     with _model() as gmsh:
         skin = gmsh.model.addDiscreteEntity(2)
         tags = np.arange(1, len(points) + 1)
         gmsh.model.mesh.addNodes(2, skin, tags, points.ravel())
-        gmsh.model.mesh.addElementsByType(skin, _TRIANGLE, [], (triangles + 1).ravel())
+        gmsh.model.mesh.addElementsByType(skin, _TYPES[3], [], (triangles + 1).ravel())
         gmsh.model.geo.addVolume([gmsh.model.geo.addSurfaceLoop([skin])])
         gmsh.model.geo.synchronize()
         gmsh.option.setNumber("Mesh.MeshSizeMax", size)
         gmsh.option.setNumber("Mesh.OptimizeNetgen", 1)
         gmsh.model.mesh.generate(3)
-        return _cells(gmsh, _TETRAHEDRON, 4, 3)
+        return _cells(gmsh, 4)
 
 
-def _cells(gmsh: Any, kind: int, corners: int, dimension: int) -> tuple[np.ndarray, np.ndarray]:
+def _cells(gmsh: Any, corners: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the nodes in the order of their tags, those given first, and the elements."""
     tags, places, _ = gmsh.model.mesh.getNodes()
     order = np.argsort(tags)
-    _, rows = gmsh.model.mesh.getElementsByType(kind)
+    _, rows = gmsh.model.mesh.getElementsByType(_TYPES[corners])
     if not len(rows):
         raise InputError("gmsh found no elements")
     elements = np.searchsorted(tags[order], rows).reshape(-1, corners)
-    return places.reshape(-1, 3)[order][:, :dimension], elements
+    return places.reshape(-1, 3)[order], elements
 
 
 @contextmanager
 def _model() -> Iterator[Any]:
     """Yield Gmsh with an empty model; its errors become :class:`InputError`."""
-    gmsh = _gmsh()
+    try:
+        gmsh = import_module("gmsh")
+    except ModuleNotFoundError as error:
+        if error.name != "gmsh":
+            raise
+        raise InputError("meshing needs gmsh: pip install 'soft-tissue-calibrate[gmsh]'") from error
+    except OSError as error:  # ctypes, of a library that is not on this machine
+        raise InputError(
+            f"gmsh is installed but does not load ({error}): it needs the system's OpenGL and X11 "
+            "libraries, without a display; on Debian apt install libgl1 libglu1-mesa libxcursor1 "
+            "libxinerama1 libxft2 libgomp1"
+        ) from error
     owns_session = not gmsh.isInitialized()
     if owns_session:
         gmsh.initialize(readConfigFiles=False, interruptible=False)
@@ -135,39 +138,13 @@ def _model() -> Iterator[Any]:
             gmsh.model.setCurrent(previous_model)
 
 
-def _gmsh() -> Any:
-    try:
-        return import_module("gmsh")
-    except ModuleNotFoundError as error:
-        if error.name != "gmsh":
-            raise
-        raise InputError("meshing needs gmsh: pip install 'soft-tissue-calibrate[gmsh]'") from error
-    except OSError as error:  # ctypes, of a library that is not on this machine
-        raise InputError(
-            f"gmsh is installed but does not load ({error}): it needs the system's OpenGL and X11 "
-            "libraries, without a display; on Debian apt install libgl1 libglu1-mesa libxcursor1 "
-            "libxinerama1 libxft2 libgomp1"
-        ) from error
-
-
 _HALVINGS = 30  # of an interval, until the middle of an edge is known to round-off
 
 
 class DiscMap:
-    """The map from the unit disc to a surface with one rim.
+    """The map from the unit disc to a surface with one rim; :class:`InputError` for another number.
 
-    Parameters
-    ----------
-    surface : the surface, in mm.
-
-    Attributes
-    ----------
-    places : the positions (n, 2) of the surface's points in the disc.
-
-    Raises
-    ------
-    InputError
-        A surface with another number of openings than one.
+    surface : in mm. length : of its rim, mm. places : of its points in the disc, (n, 2).
     """
 
     def __init__(self, surface: Surface) -> None:
@@ -178,7 +155,9 @@ class DiscMap:
         while (next_one := successor[loop[-1]]) != loop[0]:
             loop.append(next_one)
         closed = surface.points[[*loop, loop[0]]]
-        self._along = np.concatenate([[0.0], np.cumsum(_lengths(closed))])
+        self._along = np.concatenate(
+            [[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))]
+        )
         self._rim = closed
         self.length = float(self._along[-1])
         turn = 2.0 * np.pi * self._along[:-1] / self.length
@@ -217,26 +196,24 @@ class DiscMap:
         places, rows = triangulate([polygon], lambda x, y: size / stretch[nearest.query((x, y))[1]])
         points = self.at(places)
         points[:count] = self.rim_at(turn)
-        facing = np.sign(np.sum(_signed(places[rows])))
-        original_facing = np.sign(np.sum(_signed(self._corners)))
-        return Surface(
-            self.surface.name, points, rows if facing == original_facing else rows[:, ::-1]
-        ), places
+        now, before = (
+            np.sign(np.sum(signed_areas(corners)))
+            for corners in (places[rows], self.places[self.surface.triangles])
+        )
+        rows = rows if now == before else rows[:, ::-1]
+        return Surface(self.surface.name, points, rows), places
 
     def _stretch(self) -> np.ndarray:
         """Return lengths on the surface over those in the disc, (n,), from areas around points."""
         rows = self.surface.triangles
+        on_surface = 0.5 * np.linalg.norm(cross_sides(self.surface.points[rows]), axis=1)
         areas = [
             np.bincount(rows.ravel(), np.repeat(each, 3), len(self.places))
-            for each in (_areas(self.surface.points[rows]), np.abs(_signed(self._corners)))
+            for each in (on_surface, np.abs(signed_areas(self.places[rows])))
         ]
         # Areas over two rings of neighbours, because rough surfaces have upright triangles.
         around = [np.bincount(rows.ravel(), each[rows].sum(1).repeat(3)) for each in areas]
         return np.sqrt(around[0] / np.maximum(around[1], 1e-30))
-
-    @property
-    def _corners(self) -> np.ndarray:
-        return self.places[self.surface.triangles]
 
     def middles(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
         """Return points (k, 3) mm on the surface, equally far from both given places (k, 2).
@@ -246,15 +223,12 @@ class DiscMap:
         """
         first, last = self.at(one), self.at(other)
         low, high = np.zeros(len(one)), np.ones(len(one))
-        points = first
         for _ in range(_HALVINGS):
             share = 0.5 * (low + high)
             points = self.at(one + share[:, None] * (other - one))
             closer_to_first = np.sum((points - first) ** 2 - (points - last) ** 2, axis=1) < 0.0
-            low, high = (
-                np.where(closer_to_first, share, low),
-                np.where(closer_to_first, high, share),
-            )
+            low = np.where(closer_to_first, share, low)
+            high = np.where(closer_to_first, high, share)
         on_rim = np.all([np.linalg.norm(p, axis=1) > 1.0 - 1e-9 for p in (one, other)], axis=0)
         x, y = (one + other)[on_rim].T
         points[on_rim] = self.rim_at(np.arctan2(y, x))
@@ -265,8 +239,7 @@ def _mean_value_weights(surface: Surface) -> coo_array:
     """Return the weights (n, n) of each point's neighbours."""
     x, rows = surface.points, surface.triangles
     first, last, values = [], [], []
-    for k in range(3):
-        a, b, c = rows[:, k], rows[:, (k + 1) % 3], rows[:, (k + 2) % 3]
+    for a, b, c in (rows.T, rows.T[[1, 2, 0]], rows.T[[2, 0, 1]]):
         u, v = x[b] - x[a], x[c] - x[a]
         p, q = np.linalg.norm(u, axis=1), np.linalg.norm(v, axis=1)
         # tan(angle / 2) = |u x v| / (|u| |v| + u . v), kept above zero in slivers
@@ -277,19 +250,3 @@ def _mean_value_weights(surface: Surface) -> coo_array:
         values += [half / p, half / q]
     places = (np.concatenate(first), np.concatenate(last))
     return coo_array((np.concatenate(values), places), shape=(len(x), len(x))).tocsr()
-
-
-def _lengths(points: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(np.diff(points, axis=0), axis=1)
-
-
-def _areas(corners: np.ndarray) -> np.ndarray:
-    """Return the areas (t,) of triangles (t, 3, 3)."""
-    u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    return 0.5 * np.linalg.norm(np.cross(u, v), axis=1)
-
-
-def _signed(corners: np.ndarray) -> np.ndarray:
-    """Return the areas (t,) of triangles (t, 3, 2) in the plane, positive anticlockwise."""
-    (ux, uy), (vx, vy) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
-    return 0.5 * (ux * vy - uy * vx)

@@ -12,11 +12,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from emulator.core.errors import InputError, look_up
+from emulator.core.errors import InputError, check_known
 from emulator.geometry.mesh import Mesh, coincident, frozen_array
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*")
@@ -39,8 +39,8 @@ class Bodies:
 
     def elements(self, name: str) -> np.ndarray:
         """Return the elements (k,) of body ``name``; :class:`InputError` lists the bodies."""
-        index = look_up({n: k for k, n in enumerate(self.names)}, name, "body")
-        return np.flatnonzero(self.body == index)
+        check_known(name, self.names, "body")
+        return np.flatnonzero(self.body == self.names.index(name))
 
     def nodes(self, name: str) -> np.ndarray:
         """Return all nodes (k,) of body ``name``, in its own order."""
@@ -57,16 +57,14 @@ class Bodies:
             A body without values, or with values of another shape or number of elements.
         """
         parts: list[np.ndarray] = []
-        for k, name in enumerate(self.names):
+        for name, count in zip(self.names, np.bincount(self.body), strict=True):
             if name not in values:
                 raise InputError(f"bodies: no values for '{name}'; give one array for each")
-            part, count = np.asarray(values[name]), int(np.sum(self.body == k))
+            part = np.asarray(values[name])
             if len(part) != count or (parts and part.shape[1:] != parts[0].shape[1:]):
                 others = f" and {parts[0].shape[1:]} for '{self.names[0]}'" if parts else ""
-                raise InputError(
-                    f"bodies: values of '{name}' have shape {part.shape}; it has {count} elements"
-                    + others
-                )
+                problem = f"bodies: values of '{name}' have shape {part.shape}"
+                raise InputError(f"{problem}; it has {count} elements{others}")
             parts.append(part)
         return np.concatenate(parts)
 
@@ -98,20 +96,32 @@ def side_by_side(meshes: Mapping[str, Mesh], *, gap: float | None = None) -> Bod
             )
     for name in meshes:
         check_name(name)
-    placed = list(meshes.values()) if gap is None else _separate(list(meshes.values()), gap)
-    names = tuple(meshes)
-    sizes = [len(mesh.nodes) for mesh in placed]
-    starts = np.concatenate([[0], np.cumsum(sizes)])
+    names, placed = tuple(meshes), [*meshes.values()]
+    if gap is not None:
+        for k, mesh in enumerate(placed[1:], 1):
+            beyond = placed[k - 1].nodes[:, 0].max() + gap - mesh.nodes[:, 0].min()
+            placed[k] = shifted(mesh, (beyond, 0.0, 0.0))
     nodes = np.concatenate([mesh.nodes for mesh in placed])
-    _check_apart(names, nodes, np.repeat(np.arange(len(names)), sizes))
+    owner = np.repeat(np.arange(len(names)), [len(mesh.nodes) for mesh in placed])
+    pairs = coincident(nodes)
+    pairs = pairs[owner[pairs[:, 0]] != owner[pairs[:, 1]]]
+    if len(pairs):
+        one, other = np.sort(owner[pairs[0]])
+        raise InputError(
+            f"bodies: '{names[one]}' and '{names[other]}' have {len(pairs)} nodes at the same "
+            "places, where it is not clear whose a support is; move one of them"
+        )
+    elements: list[np.ndarray] = []
     node_sets: dict[str, np.ndarray] = {}
     facet_sets: dict[str, np.ndarray] = {}
-    for name, mesh, start in zip(names, placed, starts[:-1], strict=True):
+    start = 0
+    for name, mesh in zip(names, placed, strict=True):
+        elements.append(mesh.elements + start)
         facet_sets[name] = mesh.surface + start
         node_sets[name] = np.unique(facet_sets[name])
         node_sets |= {f"{name}.{of}": rows + start for of, rows in mesh.node_sets.items()}
         facet_sets |= {f"{name}.{of}": rows + start for of, rows in mesh.facet_sets.items()}
-    elements = [mesh.elements + start for mesh, start in zip(placed, starts[:-1], strict=True)]
+        start += len(mesh.nodes)
     body = np.repeat(np.arange(len(names)), [len(part) for part in elements])
     mesh = Mesh(nodes, np.concatenate(elements), node_sets, facet_sets)
     return Bodies(mesh, names, frozen_array(body, np.int64))
@@ -119,7 +129,7 @@ def side_by_side(meshes: Mapping[str, Mesh], *, gap: float | None = None) -> Bod
 
 def shifted(mesh: Mesh, shift: tuple[float, float, float]) -> Mesh:
     """Return ``mesh`` moved by ``shift`` mm."""
-    return Mesh(mesh.nodes + np.asarray(shift), mesh.elements, mesh.node_sets, mesh.facet_sets)
+    return replace(mesh, nodes=mesh.nodes + np.asarray(shift))
 
 
 def check_name(name: str) -> None:
@@ -127,24 +137,4 @@ def check_name(name: str) -> None:
     if not _NAME.fullmatch(name):
         raise InputError(
             f"body '{name}': a name has letters, digits, _ and -, and begins with a letter"
-        )
-
-
-def _separate(meshes: list[Mesh], gap: float) -> list[Mesh]:
-    """Return the meshes, each moved ``gap`` beyond the one before along x."""
-    row = meshes[:1]
-    for mesh in meshes[1:]:
-        beyond = row[-1].nodes[:, 0].max() + gap - mesh.nodes[:, 0].min()
-        row.append(shifted(mesh, (beyond, 0.0, 0.0)))
-    return row
-
-
-def _check_apart(names: tuple[str, ...], nodes: np.ndarray, owner: np.ndarray) -> None:
-    pairs = coincident(nodes)
-    pairs = pairs[owner[pairs[:, 0]] != owner[pairs[:, 1]]] if len(pairs) else pairs
-    if len(pairs):
-        one, other = sorted(int(owner[node]) for node in pairs[0])
-        raise InputError(
-            f"bodies: '{names[one]}' and '{names[other]}' have {len(pairs)} nodes at the same "
-            "places, where it is not clear whose a support is; move one of them"
         )

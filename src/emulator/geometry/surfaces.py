@@ -18,12 +18,12 @@ from pathlib import Path
 
 import numpy as np
 from scipy.sparse import coo_array, diags_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from emulator.core.errors import InputError
 from emulator.geometry.facets import enclosed_volume, openings
 from emulator.geometry.io import read_cells
+from emulator.geometry.mesh import SIDES, parts
 
 UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 """Millimetres in a unit of length."""
@@ -66,15 +66,9 @@ class Surface:
 def read_surface(path: str | Path, name: str, scale: float = 1.0) -> Surface:
     """Return a surface from STL, PLY, OBJ or another file of triangles that meshio reads.
 
-    Parameters
-    ----------
-    name : the name of the surface in messages.
-    scale : mm in one unit of the file.
+    :class:`InputError` as of :func:`surface`, or for a file that cannot be read or has other cells.
 
-    Raises
-    ------
-    InputError
-        As :func:`surface`; or a file that cannot be read or has other cells than triangles.
+    name : the name of the surface in messages. scale : mm in one unit of the file.
     """
     content = read_cells(Path(path))
     kinds = sorted({block.type for block in content.cells if len(block.data)})
@@ -83,20 +77,16 @@ def read_surface(path: str | Path, name: str, scale: float = 1.0) -> Surface:
             f"{name} {path}: it has {', '.join(kinds) or 'no cells'}; expected triangles only, "
             "as in STL or PLY"
         )
-    rows = np.concatenate([block.data for block in content.cells if block.type == "triangle"])
-    return surface(name, scale * np.asarray(content.points, dtype=float), rows)
+    points = scale * np.asarray(content.points, dtype=float)
+    return surface(name, points, content.get_cells_type("triangle"))
 
 
 def surface(name: str, points: np.ndarray, triangles: np.ndarray) -> Surface:
     """Return the surface of ``triangles`` (t, 3) between ``points`` (n, 3) mm, in any sense.
 
     Points at one place are merged, triangles without area dropped, and the others turned to face
-    out.
-
-    Raises
-    ------
-    InputError
-        Several parts, three triangles at an edge, a Moebius strip, no volume, or NaN.
+    out. :class:`InputError` for several parts, three triangles at an edge, a Moebius strip, no
+    volume, or NaN.
     """
     points = np.asarray(points, dtype=float)
     if not np.isfinite(points).all():
@@ -118,44 +108,39 @@ def _merge_points(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray
     """Return one point for each position, and the triangles whose corners differ."""
     tolerance = _MERGE * np.linalg.norm(np.ptp(points, axis=0))
     pairs = cKDTree(points, balanced_tree=False).query_pairs(tolerance, output_type="ndarray")
-    graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(points),) * 2)
-    triangles = connected_components(graph, directed=False)[1][triangles]
-    a, b, c = triangles.T
-    triangles = triangles[(a != b) & (b != c) & (c != a)]
-    label = connected_components(graph, directed=False)[1]
+    label = parts(pairs, len(points))
     _, first = np.unique(label, return_index=True)
-    vertices, renumbered = np.unique(triangles, return_inverse=True)
+    a, b, c = label[triangles].T
+    differ = (a != b) & (b != c) & (c != a)
+    vertices, renumbered = np.unique(label[triangles[differ]], return_inverse=True)
     return points[first[vertices]], renumbered.reshape(-1, 3)
 
 
 def _orient_consistently(name: str, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Return the triangles turned so that neighbours list a common edge in opposite senses."""
-    edges = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    edges = triangles[:, SIDES].reshape(-1, 2)
     owner = np.repeat(np.arange(len(triangles)), 3)
-    low, high = edges.min(axis=1), edges.max(axis=1)
-    order = np.lexsort((high, low))
-    same = (low[order][1:] == low[order][:-1]) & (high[order][1:] == high[order][:-1])
-    if (same[1:] & same[:-1]).any():
-        k = order[1:-1][same[1:] & same[:-1]][0]
-        position = place_of(points[edges[k]].mean(axis=0))
+    ends = np.sort(edges, axis=1)
+    order = np.lexsort(ends.T[::-1])
+    same = (ends[order][1:] == ends[order][:-1]).all(axis=1)
+    if (thrice := same[1:] & same[:-1]).any():
+        position = place_of(points[edges[order[1:-1][thrice][0]]].mean(axis=0))
         raise InputError(
             f"{name}: more than two triangles meet at the edge at {position}; repair the surface"
         )
     one, other = order[:-1][same], order[1:][same]
-    agree = edges[one, 0] != edges[other, 0]
     # Two copies of each triangle, one turned: neighbours that disagree join unlike copies.
     count = len(triangles)
-    component = np.where(agree, 0, count)
+    copy = np.where(edges[one, 0] != edges[other, 0], 0, count)
     first = np.concatenate([owner[one], owner[one] + count])
-    second = np.concatenate([owner[other] + component, owner[other] + count - component])
-    graph = coo_array((np.ones(len(first)), (first, second)), shape=(2 * count,) * 2)
-    parts, label = connected_components(graph, directed=False)
-    if parts == 1:
+    second = np.concatenate([owner[other] + copy, owner[other] + count - copy])
+    label = parts(np.column_stack([first, second]), 2 * count)
+    sizes = np.sort(np.bincount(label))[::-2]
+    if label.max() == 0:
         raise InputError(f"{name}: it has one side only; expected an inside and an outside")
-    if parts > 2:
-        sizes = np.sort(np.bincount(label))[::-2]
+    if len(sizes) > 1:
         raise InputError(
-            f"{name}: it has {parts // 2} separate parts, the largest of {sizes[0]} triangles and "
+            f"{name}: it has {len(sizes)} separate parts, the largest of {sizes[0]} triangles and "
             f"the next of {sizes[1]}; expected one: keep the largest"
         )
     flipped = label[:count] != label[0]
@@ -170,10 +155,7 @@ def place_of(point: np.ndarray) -> str:
 def cut(surface: Surface, point: np.ndarray, normal: np.ndarray) -> Surface:
     """Return the part below the plane through ``point`` (3,) mm with upward ``normal`` (3,).
 
-    Raises
-    ------
-    InputError
-        A plane that does not cut the surface, or leaves another number of openings than one.
+    :class:`InputError` where the plane does not cut the surface, or leaves not just one opening.
     """
     height = (surface.points - point) @ normal
     height[np.abs(height) < _SNAP * surface.extent] = 0.0
@@ -183,39 +165,28 @@ def cut(surface: Surface, point: np.ndarray, normal: np.ndarray) -> Surface:
             f"{surface.name}: all of it is {where} the base plane through {place_of(point)}, its "
             f"heights {height.min():.4g} to {height.max():.4g} mm; expected a plane that cuts it"
         )
-    points = np.where(
-        (height == 0.0)[:, None],
-        surface.points - np.outer((surface.points - point) @ normal, normal),
-        surface.points,
-    )
+    flat = surface.points - np.outer((surface.points - point) @ normal, normal)
+    points = np.where((height == 0.0)[:, None], flat, surface.points)
     sign = np.sign(height).astype(int)[surface.triangles]
     below = (sign <= 0).all(axis=1) & (sign < 0).any(axis=1)
-    pieces = [surface.triangles[below]]
-    new_points: list[np.ndarray] = []
+    rows = surface.triangles[below].tolist()
     numbers: dict[tuple[int, int], int] = {}
-
-    def between(a: int, b: int) -> int:
-        key = (min(a, b), max(a, b))
-        if key not in numbers:
-            low, high = key
-            share = height[low] / (height[low] - height[high])
-            numbers[key] = len(points) + len(new_points)
-            new_points.append(points[low] + share * (points[high] - points[low]))
-        return numbers[key]
-
-    new: list[tuple[int, int, int]] = []
+    new: list[np.ndarray] = []
     for row in surface.triangles[(sign < 0).any(axis=1) & (sign > 0).any(axis=1)].tolist():
         polygon: list[int] = []
-        for a, b in zip(row, [*row[1:], row[0]], strict=True):
+        for a, b in ((row[0], row[1]), (row[1], row[2]), (row[2], row[0])):
             if height[a] <= 0.0:
                 polygon.append(a)
             if height[a] * height[b] < 0.0:
-                polygon.append(between(a, b))
-        new += [(polygon[0], polygon[k], polygon[k + 1]) for k in range(1, len(polygon) - 1)]
-    pieces.append(np.array(new, dtype=np.int64).reshape(-1, 3))
-    rows = np.concatenate(pieces)
+                low, high = edge = min(a, b), max(a, b)
+                if edge not in numbers:
+                    numbers[edge] = len(points) + len(new)
+                    share = height[low] / (height[low] - height[high])
+                    new.append(points[low] + share * (points[high] - points[low]))
+                polygon.append(numbers[edge])
+        rows += [(polygon[0], polygon[k], polygon[k + 1]) for k in range(1, len(polygon) - 1)]
     vertices, numbered = np.unique(rows, return_inverse=True)
-    places = np.concatenate([points, np.array(new_points).reshape(-1, 3)])[vertices]
+    places = np.concatenate([points, np.array(new).reshape(-1, 3)])[vertices]
     below_it = Surface(surface.name, places, numbered.reshape(-1, 3))
     one_rim(below_it)
     return below_it
@@ -244,7 +215,7 @@ def smoothed(surface: Surface, times: int) -> Surface:
     A flat rim stays in its plane.
     """
     count, rows = len(surface.points), surface.triangles
-    edges = np.concatenate([rows[:, [0, 1]], rows[:, [1, 2]], rows[:, [2, 0]]])
+    edges = rows[:, SIDES].reshape(-1, 2)
     on_rim = np.zeros(count, dtype=bool)
     rims = surface.rims
     for rim in rims:
@@ -268,9 +239,7 @@ def inside(surface: Surface, points: np.ndarray, axis: np.ndarray) -> np.ndarray
     # Rays are tilted against any grid, so that they practically never meet an edge.
     up = axis + _TILT * np.array([0.618, 0.733, 0.285])
     up /= np.linalg.norm(up)
-    across = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
-    across /= np.linalg.norm(across)
-    frame = np.stack([across, np.cross(up, across), up], axis=1)
+    frame = np.stack([*axes_across(up), up], axis=1)
     corners, at = surface.points[surface.triangles] @ frame, points @ frame
     flat = corners[..., :2]
     middle = flat.mean(axis=1)
@@ -278,17 +247,28 @@ def inside(surface: Surface, points: np.ndarray, axis: np.ndarray) -> np.ndarray
     neighbours = cKDTree(middle, balanced_tree=False).query_ball_point(at[:, :2], 1.000001 * reach)
     point = np.repeat(np.arange(len(at)), [len(candidates) for candidates in neighbours])
     row = np.concatenate([np.asarray(candidates, dtype=np.int64) for candidates in neighbours])
-    a, b, c = (corners[row, k] for k in range(3))
-    p = at[point]
-
-    def area(u: np.ndarray, v: np.ndarray, w: np.ndarray) -> np.ndarray:
-        return (v[:, 0] - u[:, 0]) * (w[:, 1] - u[:, 1]) - (v[:, 1] - u[:, 1]) * (w[:, 0] - u[:, 0])
-
-    parts = np.stack([area(b, c, p), area(c, a, p), area(a, b, p)], axis=1)
-    hits = (parts >= 0.0).all(axis=1) | (parts <= 0.0).all(axis=1)
-    total = parts.sum(axis=1)
+    # The areas between a ray and each side of the triangle, seen along the rays.
+    rays, opposite = at[point, None, :2], ((1, 2), (2, 0), (0, 1))
+    areas = np.stack(
+        [signed_areas(np.hstack([flat[row][:, side], rays])) for side in opposite], axis=1
+    )
+    hits = (areas >= 0.0).all(axis=1) | (areas <= 0.0).all(axis=1)
+    total = areas.sum(axis=1)
     hits &= total != 0.0
-    weights = parts[hits] / total[hits, None]
+    weights = areas[hits] / total[hits, None]
     height = np.einsum("ka,ka->k", weights, corners[row[hits], :, 2])
-    below = height < p[hits, 2]
+    below = height < at[point[hits], 2]
     return np.bincount(point[hits][below], minlength=len(at)) % 2 == 1
+
+
+def axes_across(normal: np.ndarray) -> np.ndarray:
+    """Return two unit vectors (2, 3) across the unit ``normal`` (3,) and each other."""
+    first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(normal, first)])
+
+
+def signed_areas(corners: np.ndarray) -> np.ndarray:
+    """Return the areas (t,) of triangles (t, 3, 2) in the plane, positive anticlockwise."""
+    (ux, uy), (vx, vy) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
+    return 0.5 * (ux * vy - uy * vx)

@@ -19,15 +19,15 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from emulator.core.errors import InputError, look_up
-from emulator.geometry.discretisation import discretise
+from emulator.geometry.discretisation import MeshQuality, discretise, mesh_quality
 from emulator.geometry.facets import MM3_PER_ML, Cavity
-from emulator.geometry.mesh import Mesh, orient
-from emulator.geometry.quality import MeshQuality, mesh_quality
+from emulator.geometry.mesh import SIDES, Mesh, find_rows, orient
 from emulator.geometry.refinement import to_quadratic
 from emulator.geometry.remeshing import DiscMap, tetrahedralise, triangulate
 from emulator.geometry.surfaces import (
     UNITS,
     Surface,
+    axes_across,
     cut,
     inside,
     one_rim,
@@ -146,20 +146,19 @@ def mesh_wall(
     ]
     normal, point = _plane(intact, axis, base_height, base_point)
     below = [cut(each, point, normal) for each in intact]
-    heights = [((each.points - point) @ normal).max() for each in intact]
-    closed = any(not each.rims for each in intact)
-    cut_off = 0.0 if closed else max(heights)
-    within = [smoothed(each, smooth) if smooth else each for each in below]
-    _check_nested(within[0], within[1], normal)
-    thickness = _thickness(within[0], within[1])
+    is_open = all(each.rims for each in intact)
+    cut_off = max(((each.points - point) @ normal).max() for each in intact) if is_open else 0.0
+    inner, outer = (smoothed(each, smooth) for each in below)
+    _check_nested(inner, outer, normal)
+    thickness = _thickness(inner, outer)
     size = _SIZE * thickness.median if size is None else size
     if not 0.0 < size < intact[1].extent / 4.0:
         raise InputError(
             f"size {size} mm: expected edges above 0 and below a quarter of the epicardium's "
             f"extent, {intact[1].extent:.4g} mm"
         )
-    mesh = _mesh([DiscMap(each) for each in within], size, order, normal, point)
-    cavity, outer = (each.volume / MM3_PER_ML for each in below)
+    mesh = _mesh([DiscMap(inner), DiscMap(outer)], size, order, normal, point)
+    cavity, whole = (each.volume / MM3_PER_ML for each in below)
     try:
         own = float(discretise(mesh).weights.sum()) / MM3_PER_ML
     except InputError as error:
@@ -167,19 +166,18 @@ def mesh_wall(
             f"edges of {size:.3g} mm are too long for such curved surfaces ({error}): choose a "
             "smaller size, or order 1"
         ) from error
-    rim = below[0].points[np.unique(one_rim(below[0]))]
     return Wall(
         mesh=mesh,
         axis=normal,
-        base=rim.mean(axis=0),
+        base=below[0].points[np.unique(one_rim(below[0]))].mean(axis=0),
         size=float(size),
         thickness=thickness,
         cavity=(Cavity(mesh, "endocardium").rest, cavity),
-        wall=(own, outer - cavity),
+        wall=(own, whole - cavity),
         cut_off=float(cut_off) if cut_off > _SAME * intact[1].extent else 0.0,
         moved=max(
             float(np.linalg.norm(one.points - other.points, axis=1).max())
-            for one, other in zip(within, below, strict=True)
+            for one, other in zip((inner, outer), below, strict=True)
         ),
         quality=mesh_quality(mesh),
     )
@@ -206,23 +204,20 @@ def _plane(
         raise InputError("base plane: give a height or a point, not both")
     has_plane = height is not None or point is not None
     rims = [(each, one_rim(each)) for each in surfaces if each.rims or not has_plane]
+    normal = np.zeros(3) if axis is None else np.asarray(axis, dtype=float)
     if axis is None:
         if len(rims) < len(surfaces):
             raise InputError(
                 "long axis: give it, from apex to base; it is found only where both surfaces are "
                 "open at the base"
             )
-        normal = np.zeros(3)
         for each, edges in rims:
             normal += np.cross(each.points[edges[:, 0]], each.points[edges[:, 1]]).sum(axis=0)
-    else:
-        normal = np.asarray(axis, dtype=float)
+        middle = np.mean([each.points[edges].mean(axis=(0, 1)) for each, edges in rims], axis=0)
+        normal *= np.sign((middle - surfaces[1].points.mean(axis=0)) @ normal)
     if normal.shape != (3,) or not np.isfinite(normal).all() or not normal.any():
         raise InputError(f"long axis {axis}: expected three numbers, not all zero")
     normal = normal / np.linalg.norm(normal)
-    if axis is None:
-        middle = np.mean([each.points[edges].mean(axis=(0, 1)) for each, edges in rims], axis=0)
-        normal = normal * np.sign((middle - surfaces[1].points.mean(axis=0)) @ normal)
     if point is not None:
         return normal, np.asarray(point, dtype=float)
     if height is not None:
@@ -281,23 +276,15 @@ def _mesh(
             f"the wall is too thin for edges of {size:.3g} mm at "
             f"{place_of(inner.points[~within][0])}: choose a smaller size"
         )
-    across = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-    across /= np.linalg.norm(across)
-    frame = np.stack([across, np.cross(normal, across)])
+    frame = axes_across(normal)
     # Points of a rim come first, in its order.
     loops = [each.points[: len(one_rim(each))] for each in (outer, inner)]
     flat, annulus = triangulate([(loop - point) @ frame.T for loop in loops], size)
     outer_rim, inner_rim = map(len, loops)
     count = len(inner.points)
-    new = point + flat[outer_rim + inner_rim :] @ frame
-    points = np.vstack([inner.points, outer.points, new])
-    number = np.concatenate(
-        [
-            count + np.arange(outer_rim),
-            np.arange(inner_rim),
-            count + len(outer.points) + np.arange(len(new)),
-        ]
-    )
+    points = np.vstack([inner.points, outer.points, point + flat[outer_rim + inner_rim :] @ frame])
+    new = np.arange(count + len(outer.points), len(points))
+    number = np.concatenate([count + np.arange(outer_rim), np.arange(inner_rim), new])
     facets = {
         "endocardium": inner.triangles,
         "epicardium": count + outer.triangles,
@@ -313,19 +300,13 @@ def _mesh(
 
     def midpoints(edges: np.ndarray) -> np.ndarray:
         middle = mesh.nodes[edges].mean(axis=1)
-        for which, disc, each, first in (
-            (inner, in_disc, maps[0], 0),
-            (outer, out_disc, maps[1], count),
+        for name, disc, each, first in (
+            ("endocardium", in_disc, maps[0], 0),
+            ("epicardium", out_disc, maps[1], count),
         ):
-            on = _among(edges, which.triangles + first, len(mesh.nodes))
+            on = find_rows(edges, facets[name][:, SIDES].reshape(-1, 2)) >= 0
             one, other = (edges[on] - first).T
             middle[on] = each.middles(disc[one], disc[other])
         return middle
 
     return to_quadratic(mesh, midpoints)
-
-
-def _among(edges: np.ndarray, triangles: np.ndarray, count: int) -> np.ndarray:
-    """Return whether each of ``edges`` (e, 2), lower node first, is a side of ``triangles``."""
-    sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    return np.isin(edges @ [count, 1], sides @ [count, 1])

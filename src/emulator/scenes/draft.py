@@ -15,10 +15,10 @@ from typing import NamedTuple
 import numpy as np
 
 from emulator.core.errors import InputError, look_up
+from emulator.geometry.discretisation import mesh_quality
 from emulator.geometry.facets import mean_normal
 from emulator.geometry.io import Body, read_body, write_mesh
 from emulator.geometry.mesh import EDGES, Mesh
-from emulator.geometry.quality import mesh_quality
 from emulator.geometry.surfaces import UNITS
 from emulator.mechanics.laws import find_law
 from emulator.mechanics.laws.law import Quantity

@@ -16,9 +16,14 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.core.representation import TableRepr
-from emulator.geometry.discretisation import Blocks, Discretisation, discretise, quadrature_points
+from emulator.geometry.discretisation import (
+    Blocks,
+    Discretisation,
+    discretise,
+    patchwise,
+    quadrature_points,
+)
 from emulator.geometry.facets import Cavity, encloses
-from emulator.geometry.patches import patchwise
 from emulator.scenes.identity import Identity, fingerprint, identity_of
 from emulator.scenes.parameter_space import ParameterSpace
 from emulator.scenes.scene_data import SceneData

@@ -54,7 +54,7 @@ class SceneData:
     dilatation : ``pointwise``, or ``mean`` to use the mean volume change of each element, which
         keeps quadratic elements from locking when the material is nearly incompressible, or
         ``patch`` to use that of about six neighbouring linear ones, which helps these
-        (:mod:`emulator.geometry.patches`).
+        (:class:`~emulator.geometry.discretisation.Patches`).
     sheets : unit sheet directions across the fibres, likewise.
     regions : (m,) whole number of the region each element lies in. Region 3 takes a parameter or a
         constant ``stiffness_3``, by which the law's energy there is multiplied, except its

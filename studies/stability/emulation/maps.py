@@ -10,7 +10,7 @@ import numpy as np
 from studies.stability.emulation.check import Ended, add
 
 import emulator as em
-from emulator.accuracy.estimate import error_bar
+from emulator.accuracy.estimate import ErrorBar
 from emulator.fem import Simulator
 from emulator.surrogates.emulator import Emulator
 
@@ -53,7 +53,7 @@ def _outside(name: str, out: float) -> Ended:
     """Outside, a map says so, and the error bar is right or is not trusted."""
     forward, scene = shipped(name).cache(), shipped(name).scene
     simulator, ratios, failed = Simulator(scene), [], 0
-    bar = error_bar(forward, simulator)
+    bar = ErrorBar(forward, simulator)
     for x in positions(len(scene.parameters), out):
         theta = scene.from_unit(jnp.asarray(x))
         if bool(forward.evaluate(theta).valid):

@@ -15,7 +15,7 @@ import numpy as np
 from studies.stability.emulation.check import Ended, add
 
 import emulator as em
-from emulator.accuracy.estimate import error_bar
+from emulator.accuracy.estimate import ErrorBar
 from emulator.fem import Simulator, sobol
 from emulator.scenes import Scene
 from emulator.surrogates.emulator import Emulator
@@ -68,7 +68,7 @@ def judge(found: Emulator) -> Ended:
     predicted = np.stack([np.asarray(forward(theta)) for theta in thetas])
     if not np.isfinite(predicted).all():
         return Ended("TRAINED", "the trained emulator's displacement is not finite")
-    bar, ratios, flagged = error_bar(forward, simulator), [], 0
+    bar, ratios, flagged = ErrorBar(forward, simulator), [], 0
     for theta, u in zip(thetas, predicted, strict=True):
         exact = np.asarray(simulator.solve(theta).require_converged().displacement)
         true = float(np.median(np.linalg.norm(u - exact, axis=1)))

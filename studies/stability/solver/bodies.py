@@ -11,12 +11,12 @@ import numpy as np
 from studies.stability.solver.case import SEED
 
 from emulator import Parameter, Scene, Support
-from emulator.geometry.fibres import rule_based_fibres
 from emulator.geometry.generators.box import box
 from emulator.geometry.generators.ellipsoid import EllipsoidalWall, truncated_ellipsoid
 from emulator.geometry.mesh import Mesh, signed_volumes
 from emulator.geometry.refinement import to_quadratic
 from emulator.mechanics.laws import find_law
+from emulator.scenes.fibre_rules import Helix
 from emulator.scenes.loads import KPA_PER_MMHG, CavityPressure, Gravity
 
 MODULI = (Parameter("mu", "kPa", 1.0, 10.0, "log"), Parameter("lam", "kPa", 1.0, 10.0, "log"))
@@ -98,7 +98,7 @@ def ventricle(*, thin: bool = False, order: int = 1, dilatation: str = "pointwis
             "b_f": 3.0,
             "kappa": 25.0 if dilatation == "pointwise" else 1e4,
         },
-        fibres=rule_based_fibres(mesh),
+        fibres=Helix((90.0, -90.0)).directions(mesh)[0],
         dilatation=dilatation,
     )
 

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from emulator.accuracy.distance import newton_distance, valid_state
+from emulator.accuracy.estimate import newton_distance, valid_state
 from emulator.fem.energy import volume_ratio
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.accuracy.estimate import error_bar
+from emulator.accuracy.estimate import ErrorBar
 from emulator.core.errors import InputError
 from emulator.scenes.scene import all_nodes
 from emulator.surrogates.corrected import newton_step
@@ -45,7 +45,7 @@ def off(beam, exact):
 @pytest.fixture(scope="module")
 def bar(simulator, off):
     """One for all sizes, so that it compiles once."""
-    return error_bar(off(0.0), simulator)
+    return ErrorBar(off(0.0), simulator)
 
 
 def far(field, error):
@@ -127,7 +127,7 @@ def test_a_short_step_far_from_balance_is_not_believed(corner):
     error = forward(theta) - simulator(theta)
     once = newton_step(simulator.system, forward(theta), theta) - forward(theta)
     assert jnp.linalg.norm(once) < 0.5 * jnp.linalg.norm(error)
-    bar = error_bar(forward, simulator)
+    bar = ErrorBar(forward, simulator)
     for estimate in (bar(theta), jax.jit(bar)(theta)):
         assert estimate.valid
         assert far(estimate.field, error) < 0.25
@@ -190,10 +190,10 @@ def test_nothing_that_is_not_finite_comes_out(beam, bar, exact, what):
 
 def test_refusals(beam, simulator, off, cube):
     with pytest.raises(InputError, match="over all nodes"):
-        error_bar(fem_forward(simulator).at(np.array([3])), simulator)
+        ErrorBar(fem_forward(simulator).at(np.array([3])), simulator)
     with pytest.raises(InputError, match="the simulator of 'twisting_cube'"):
-        error_bar(off(0.1), em.Simulator(cube))
+        ErrorBar(off(0.1), em.Simulator(cube))
     with pytest.raises(InputError, match=r"theta has shape \(3,\)"):
-        error_bar(off(0.1), simulator)(jnp.ones(3))
+        ErrorBar(off(0.1), simulator)(jnp.ones(3))
     with pytest.raises(InputError, match=r"displacement has shape \(4, 3\); expected \(45, 3\)"):
-        error_bar(off(0.1), simulator).of_field(jnp.ones((4, 3)), jnp.ones(2))
+        ErrorBar(off(0.1), simulator).of_field(jnp.ones((4, 3)), jnp.ones(2))

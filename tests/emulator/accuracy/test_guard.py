@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.accuracy.estimate import guard, invariants, outside_box
+from emulator.accuracy.estimate import guard, invariants
 from scene_support import block
 
 
@@ -29,7 +29,8 @@ def test_the_parameter_its_value_and_its_range(body):
 
 def test_zero_and_negative_on_a_log_scale_are_outside(body):
     for value in (0.0, -3.0, jnp.nan):
-        np.testing.assert_array_equal(outside_box(body, jnp.array([2.0, value])), [False, True])
+        against = guard(body, jnp.array([2.0, value]), affine(body, 1.0, 1.0, 1.0))
+        np.testing.assert_array_equal(against.outside, [False, True])
 
 
 def test_inverted(body):

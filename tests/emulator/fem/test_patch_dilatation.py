@@ -24,9 +24,9 @@ from emulator.fem.fields import element_fields
 from emulator.fem.formulations import formulation_of
 from emulator.fem.formulations.mean_dilatation import MeanDilatation
 from emulator.fem.stress_iterates import applies
+from emulator.geometry.discretisation import patches
 from emulator.geometry.generators.box import box
 from emulator.geometry.io import write_mesh
-from emulator.geometry.patches import patches
 from emulator.geometry.refinement import to_quadratic
 from emulator.scenes.effects import effects_of
 from emulator.scenes.finer import finer

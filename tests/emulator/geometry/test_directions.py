@@ -11,10 +11,11 @@ from emulator.geometry.discretisation import (
 )
 from emulator.geometry.fibres import (
     across,
-    biventricular_directions,
+    biventricular_depth,
     from_elements,
     from_nodes,
     of_elements,
+    turned,
     unit,
 )
 from emulator.geometry.generators.biventricle import biventricle
@@ -158,7 +159,8 @@ def test_a_file_made_quadratic_has_sheets_across_its_fibres(tmp_path, where):
 def test_sheets_stay_across_fibres_where_two_walls_meet(tmp_path):
     """A few elements there have neighbours of the other wall, up to 60 degrees off."""
     mesh = biventricle(rings=8, around=16, layers=(1, 1))
-    write_mesh(tmp_path / "heart.vtu", mesh, *biventricular_directions(mesh))
+    directions = turned(biventricular_depth(mesh), (90.0, -90.0), (0.0, 0.0, 1.0))
+    write_mesh(tmp_path / "heart.vtu", mesh, *directions)
     body = read_body(tmp_path / "heart.vtu", quadratic=True)
     np.testing.assert_allclose(np.sum(body.fibres * body.sheets, axis=-1), 0.0, atol=1e-12)
 

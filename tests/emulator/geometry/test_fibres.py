@@ -7,11 +7,9 @@ from emulator.core.errors import InputError
 from emulator.geometry.discretisation import discretise
 from emulator.geometry.fibres import (
     Depth,
-    biventricular_directions,
+    biventricular_depth,
     nodal_depth,
     of_elements,
-    rule_based_directions,
-    rule_based_fibres,
     turned,
     wall_depth,
 )
@@ -52,6 +50,13 @@ def analytic(wall, points):
     return t, circumferential, climbing / np.linalg.norm(climbing, axis=1, keepdims=True)
 
 
+def ruled(
+    mesh, angles=(90.0, -90.0), axis=(0.0, 0.0, 1.0), inside="endocardium", outside="epicardium"
+):
+    """Fibres and sheets by rule."""
+    return turned(wall_depth(mesh, (inside,), (outside,)), angles, axis)
+
+
 def degrees_between(a, b):
     return np.degrees(np.arccos(np.clip(np.sum(a * b, axis=-1), -1.0, 1.0)))
 
@@ -89,7 +94,7 @@ def test_a_quadratic_depth_is_an_order_better():
 def test_directions_on_an_ellipsoid_are_those_of_its_parametrisation(angle, which, most):
     mesh = human_ventricle()
     wanted = analytic(HUMAN, centroids(mesh))[which]
-    away = degrees_between(rule_based_fibres(mesh, angles=(angle, angle)), wanted)
+    away = degrees_between(ruled(mesh, (angle, angle))[0], wanted)
     assert np.median(away) < 1.0
     assert away.max() < most
 
@@ -99,7 +104,7 @@ def test_fibres_on_an_ellipsoid_turn_as_the_analytic_ones():
     t, circumferential, climbing = analytic(HUMAN, centroids(mesh))
     alpha = np.radians(60.0 - 120.0 * t)[:, None]
     away = degrees_between(
-        rule_based_fibres(mesh, angles=(60.0, -60.0)),
+        ruled(mesh, (60.0, -60.0))[0],
         np.cos(alpha) * circumferential + np.sin(alpha) * climbing,
     )
     # A harmonic depth runs ahead of the even one in a curved wall, here by 0.05 of 120 degrees.
@@ -108,8 +113,8 @@ def test_fibres_on_an_ellipsoid_turn_as_the_analytic_ones():
 
 def test_the_helix_angle_is_linear_in_depth():
     normal = np.tile([1.0, 0.0, 0.0], (3, 1))
-    found = turned(Depth(np.array([0.0, 0.5, 1.0]), normal), (-90.0, 90.0), (0.0, 0.0, 2.0))
-    np.testing.assert_allclose(found.fibres, [[0, 0, -1], [0, 1, 0], [0, 0, 1]], atol=1e-15)
+    fibres, _ = turned(Depth(np.array([0.0, 0.5, 1.0]), normal), (-90.0, 90.0), (0.0, 0.0, 2.0))
+    np.testing.assert_allclose(fibres, [[0, 0, -1], [0, 1, 0], [0, 0, 1]], atol=1e-15)
 
 
 def test_directions_are_orthonormal_and_a_wall_across_the_axis_has_some():
@@ -119,7 +124,7 @@ def test_directions_are_orthonormal_and_a_wall_across_the_axis_has_some():
         (land_ventricle(4, 12, 1, order=2), "endocardium", "epicardium"),
         (slab, "bottom", "top"),
     ):
-        fibres, sheets = rule_based_directions(mesh, inside, outside)
+        fibres, sheets = ruled(mesh, inside=inside, outside=outside)
         count = len(mesh.elements)
         assert fibres.shape == ((count, 3) if mesh.order == 1 else (count, 4, 3))
         np.testing.assert_allclose(np.linalg.norm(fibres, axis=-1), 1.0)
@@ -129,7 +134,7 @@ def test_directions_are_orthonormal_and_a_wall_across_the_axis_has_some():
 
 def test_each_ventricle_has_its_own_depth():
     mesh = biventricle(rings=12, around=24, layers=(3, 2))
-    fibres, sheets = biventricular_directions(mesh, angles=(60.0, -60.0))
+    fibres, sheets = turned(biventricular_depth(mesh), (60.0, -60.0), (0.0, 0.0, 1.0))
     np.testing.assert_allclose(np.linalg.norm(fibres, axis=1), 1.0)
     np.testing.assert_allclose(np.einsum("mi,mi->m", fibres, sheets), 0.0, atol=1e-12)
     for name, climbs in (("lv_endocardium", 1), ("rv_endocardium", -1), ("epicardium", -1)):
@@ -145,7 +150,8 @@ def test_each_ventricle_has_its_own_depth():
 
 def test_a_wall_of_one_layer_has_directions():
     # All nodes of the free wall are on surfaces, where the left ventricle's fields are constant.
-    fibres, sheets = biventricular_directions(biventricle(rings=8, around=16, layers=(1, 1)))
+    depth = biventricular_depth(biventricle(rings=8, around=16, layers=(1, 1)))
+    fibres, sheets = turned(depth, (90.0, -90.0), (0.0, 0.0, 1.0))
     np.testing.assert_allclose(np.linalg.norm(fibres, axis=1), 1.0)
     np.testing.assert_allclose(np.linalg.norm(sheets, axis=1), 1.0)
 
@@ -155,7 +161,7 @@ def test_quadratic_elements_have_more_accurate_fibres_where_they_are_used():
     median, largest = [], []
     for order in (1, 2):
         mesh = human_ventricle(4, 8, 1, order)
-        found = rule_based_fibres(mesh, angles=(0.0, 0.0)).reshape(-1, 3)
+        found = ruled(mesh, (0.0, 0.0))[0].reshape(-1, 3)
         _, circumferential, _ = analytic(HUMAN, quadrature_points_of(mesh).reshape(-1, 3))
         away = degrees_between(found, circumferential)
         median.append(np.median(away))
@@ -169,8 +175,7 @@ def test_quadratic_and_linear_elements_have_the_same_fibres_in_the_limit():
     gaps = []
     for n in (1, 2):
         linear, quadratic = (
-            rule_based_fibres(human_ventricle(4 * n, 8 * n, n, order), angles=(60.0, -60.0))
-            for order in (1, 2)
+            ruled(human_ventricle(4 * n, 8 * n, n, order), (60.0, -60.0))[0] for order in (1, 2)
         )
         gaps.append(np.median(degrees_between(linear, of_elements(quadratic))))
     assert order_of(np.array(gaps))[0] > 1.5
@@ -191,12 +196,12 @@ def test_nodal_depth_is_of_linear_meshes():
 def test_bad_input_is_named():
     mesh = land_ventricle(rings=3, around=6, layers=1)
     with pytest.raises(InputError, match=r"axis \(0, 0, 0\); expected three numbers, not all zero"):
-        rule_based_fibres(mesh, axis=(0, 0, 0))
+        ruled(mesh, axis=(0, 0, 0))
     with pytest.raises(InputError, match=r"angles \(60,\); expected two numbers in degrees"):
-        rule_based_fibres(mesh, angles=(60,))
+        ruled(mesh, (60,))
     with pytest.raises(InputError, match="facet set 'inside' is not in the mesh"):
-        rule_based_fibres(mesh, endocardium="inside")
+        ruled(mesh, inside="inside")
     facets = mesh.facet_set("endocardium")
     closed = replace(mesh, facet_sets={"endocardium": facets, "epicardium": facets})
     with pytest.raises(InputError, match="'endocardium' and 'epicardium' have nodes in common"):
-        rule_based_fibres(closed)
+        ruled(closed)

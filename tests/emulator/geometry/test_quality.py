@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from calibrate.cli import main
+from emulator.geometry.discretisation import FLAT, dihedral_angles, mesh_quality
 from emulator.geometry.generators.box import box
 from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.geometry.io import write_mesh
 from emulator.geometry.mesh import Mesh
-from emulator.geometry.quality import FLAT, dihedral_angles, mesh_quality
 from emulator.geometry.refinement import to_quadratic
 from emulator.scenes.draft import draft_scene
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from emulator.geometry.discretisation import discretise, shapes_at
-from emulator.geometry.fibres import rule_based_fibres
 from emulator.geometry.generators.box import box
 from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.geometry.refinement import refined
+from emulator.scenes.fibre_rules import Helix
 
 MESHES = {
     "linear": lambda: box((3.0, 2.0, 1.0), (2, 1, 1)),
@@ -66,7 +66,7 @@ def test_sets_stay_on_their_surfaces():
 
 def test_directions_keep_their_length_and_side():
     mesh = MESHES["curved"]()
-    found, fibres = refined(mesh), rule_based_fibres(mesh, angles=(60.0, -60.0))
+    found, fibres = refined(mesh), Helix((60.0, -60.0)).directions(mesh)[0]
     fine = found.directions(fibres)
     np.testing.assert_allclose(np.linalg.norm(fine, axis=-1), 1.0)
     parents = np.repeat(fibres[:, 0], found.children, axis=0)

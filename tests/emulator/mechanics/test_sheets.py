@@ -8,10 +8,10 @@ import pytest
 import emulator as em
 from emulator.core.errors import InputError
 from emulator.fem import Status
-from emulator.geometry.fibres import rule_based_directions
 from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
+from emulator.scenes.fibre_rules import Helix
 from emulator.scenes.loads import CavityPressure
 
 # Shear of pig myocardium, Holzapfel & Ogden (2009), Table 1.
@@ -30,7 +30,7 @@ PIG = {
 @pytest.fixture(scope="module")
 def ventricle():
     mesh = human_ventricle(5, 12, 1)
-    fibres, sheets = rule_based_directions(mesh, angles=(60.0, -60.0))
+    fibres, sheets = Helix((60.0, -60.0)).directions(mesh)
     return Scene(
         name="orthotropic ventricle",
         mesh=mesh,

@@ -8,12 +8,12 @@ import pytest
 
 from calibrate.cli import main
 from emulator.core.errors import InputError
-from emulator.geometry.fibres import rule_based_fibres
 from emulator.geometry.generators.box import box
 from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.geometry.io import write_mesh
 from emulator.geometry.refinement import to_quadratic
 from emulator.scenes.draft import draft_scene
+from emulator.scenes.fibre_rules import Helix
 from emulator.scenes.loads import CavityPressure, FollowerPressure, Gravity
 
 
@@ -29,7 +29,7 @@ def test_a_ventricle_of_named_groups(ventricle_file):
     assert scene.law.name == "holzapfel_ogden"
     assert scene.loads == (CavityPressure("endocardium"),)
     assert scene.parameter_names == ("a", "b", "a_f", "b_f", "pressure")
-    reference = rule_based_fibres(to_quadratic(human_ventricle(4, 8, 1)), angles=(60.0, -60.0))
+    reference, _ = Helix((60.0, -60.0)).directions(to_quadratic(human_ventricle(4, 8, 1)))
     # Coordinates go through a file of text.
     np.testing.assert_allclose(np.abs(scene.fibres), np.abs(reference), atol=1e-6)
     assert "its walls are named" in " ".join(made.notes)

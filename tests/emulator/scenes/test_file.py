@@ -9,15 +9,12 @@ import pytest
 import journeys
 from emulator.catalogue import find_scene, scene_from_origin
 from emulator.core.errors import InputError
-from emulator.geometry.fibres import (
-    biventricular_directions,
-    rule_based_fibres,
-)
 from emulator.geometry.generators.biventricle import biventricle
 from emulator.geometry.generators.box import box
 from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.geometry.io import write_mesh
 from emulator.scenes import Parameter
+from emulator.scenes.fibre_rules import Biventricle, Helix
 from emulator.scenes.loads import (
     ActiveTension,
     FollowerPressure,
@@ -238,7 +235,8 @@ def test_the_examples_of_the_documentation(folder):
 
     scene = find_scene(str(folder / "ventricle.toml"))
     assert (scene.mesh.order, scene.dilatation) == (2, "mean")
-    np.testing.assert_array_equal(scene.fibres, rule_based_fibres(scene.mesh, angles=(60.0, -60.0)))
+    fibres, _ = Helix((60.0, -60.0)).directions(scene.mesh)
+    np.testing.assert_array_equal(scene.fibres, fibres)
     base = scene.mesh.node_set("base")
     assert scene.held[base].tolist() == [[False, False, True]] * len(base)
     np.testing.assert_array_equal(scene.held_displacement[base], [[0.0, 0.0, 0.5]] * len(base))
@@ -286,7 +284,7 @@ def test_pressures_as_parameters_and_other_rules_for_fibres(folder):
         if rule == "uniform":
             np.testing.assert_allclose(scene.fibres, [[0.0, 0.6, 0.8]] * len(scene.mesh.elements))
         else:
-            expected = biventricular_directions(scene.mesh, (60.0, -60.0)).fibres
+            expected, _ = Biventricle((60.0, -60.0)).directions(scene.mesh)
             np.testing.assert_allclose(scene.fibres, expected)
 
 

@@ -6,17 +6,17 @@ import pytest
 
 from emulator.catalogue import find_scene
 from emulator.core.errors import InputError
-from emulator.geometry.fibres import rule_based_directions
 from emulator.geometry.generators.box import box
 from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.geometry.io import write_mesh
 from emulator.geometry.refinement import to_quadratic
+from emulator.scenes.fibre_rules import Helix
 from scene_file_support import HEART, SCENE
 
 
 def test_sheets_from_the_mesh_file_or_by_rule(folder):
     mesh = human_ventricle(5, 12, 1)
-    fibres, sheets = rule_based_directions(mesh, angles=(60.0, -60.0))
+    fibres, sheets = Helix((60.0, -60.0)).directions(mesh)
     write_mesh(folder / "heart.vtu", mesh, fibres, sheets)
     values = "a_s = 2.0\nb_s = 2.0\na_fs = 0.2\nb_fs = 2.0\nkappa"
     text = HEART.replace('"holzapfel_ogden"', '"holzapfel_ogden_orthotropic"')

@@ -284,7 +284,7 @@ def _write_indices(indices: xr.DataTree, scene: Scene, folder: Path) -> None:
     from calibrate.analysis.sensitivity import FIELD
     from calibrate.figures.sensitivity import draw
     from emulator.core.store import write_netcdf
-    from emulator.geometry.io import write_nodal
+    from emulator.geometry.io import write_vtu
 
     write_netcdf(folder / "sensitivity.nc", indices)
     draw(indices, scene, folder)
@@ -297,7 +297,7 @@ def _write_indices(indices: xr.DataTree, scene: Scene, folder: Path) -> None:
                 data[data[name].dims[0]].values, data[name].values, strict=True
             )
         }
-        write_nodal(folder / "sensitivity.vtu", scene.mesh, nodal)
+        write_vtu(folder / "sensitivity.vtu", scene.mesh, point_data=nodal)
 
 
 def _indices_in_words(indices: xr.DataTree) -> str:

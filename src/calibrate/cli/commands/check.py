@@ -155,7 +155,7 @@ def _mesh(arguments: Namespace) -> Answer:
 
     from calibrate.measurements.outputs import mesh_errors
     from emulator.accuracy.mesh_error import mesh_error
-    from emulator.geometry.quality import mesh_quality
+    from emulator.geometry.discretisation import mesh_quality
 
     folder = None if arguments.out is None else check_folder(arguments.out)
     scene = words.scene_of(arguments)

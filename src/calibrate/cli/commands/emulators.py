@@ -53,9 +53,9 @@ def predict(arguments: Namespace) -> Answer:
     estimate, against = None, jax.jit(partial(guard, scene))(theta, u)
     if arguments.error_bar:
         from emulator import Simulator
-        from emulator.accuracy.estimate import error_bar
+        from emulator.accuracy.estimate import ErrorBar
 
-        estimate = error_bar(forward, Simulator(scene)).of_field(u, theta)
+        estimate = ErrorBar(forward, Simulator(scene)).of_field(u, theta)
         against = estimate.guard
     finite = bool(against.finite)
     result: dict[str, Any] = {

@@ -28,11 +28,11 @@ from emulator.geometry.generators.ellipsoid import (
     HUMAN,
     EllipsoidalWall,
     disc,
+    polar,
     toward_base,
     wall_midpoints,
 )
-from emulator.geometry.mesh import Mesh
-from emulator.geometry.refinement import Midpoints
+from emulator.geometry.mesh import SIDES, Mesh, find_rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +62,10 @@ def open_sheet(triangles: np.ndarray, inside: np.ndarray, strips: int) -> Footpr
     The new vertices are numbered after the old ones, line by line.
     """
     within = inside[triangles].all(axis=1)
-    edges = np.intersect1d(_edge_keys(triangles[within]), _edge_keys(triangles[~within]))
-    ends = np.column_stack(np.divmod(edges, _KEY))  # lower vertex first, as extrude sorts them
+    inner, outer = triangles[within], triangles[~within]
+    # Edges of both, lower vertex first, as extrude sorts them.
+    edges = np.unique(np.sort(inner[:, SIDES].reshape(-1, 2), axis=1), axis=0)
+    ends = edges[find_rows(edges, outer[:, SIDES].reshape(-1, 2)) >= 0]
     line = np.unique(ends)
     levels = len(inside) + np.arange(len(line) * strips).reshape(strips, len(line)).T
     levels = np.column_stack([line, levels])
@@ -73,16 +75,7 @@ def open_sheet(triangles: np.ndarray, inside: np.ndarray, strips: int) -> Footpr
     a0, a1, b0, b1 = (part.ravel() for part in (a[:, :-1], a[:, 1:], b[:, :-1], b[:, 1:]))
     band = np.concatenate([np.column_stack([a0, b0, b1]), np.column_stack([a0, a1, b1])])
     origin = np.concatenate([np.arange(len(inside)), np.tile(line, strips)])
-    return Footprint(origin, line, levels, triangles[within], renumbered[triangles[~within]], band)
-
-
-_KEY = 1 << 31
-
-
-def _edge_keys(triangles: np.ndarray) -> np.ndarray:
-    """Return one number for each edge of triangles, the same from either triangle."""
-    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    return np.unique(edges[:, 0] * _KEY + edges[:, 1])
+    return Footprint(origin, line, levels, inner, renumbered[outer], band)
 
 
 def spread(
@@ -216,58 +209,51 @@ def biventricle(
         raise InputError(f"biventricle: {layers} layers through the walls; expected at least 1")
     through, strips = layers
     septum = Septum(left, right)
-    flat = _open_disc(septum, rings, around, strips, grading)
-    wall = stacked(len(flat.r), through)
-    in_wall = _in_columns(wall, flat.r, flat.phi)
-    sheet, in_sheet = _sheet(flat, wall, strips)
-    opened, free = flat.opened, flat.free
-    elements = np.concatenate(
-        [
-            extrude(wall, np.concatenate([opened.inner, opened.outer, opened.band])),
-            extrude(sheet, opened.inner),
-        ]
-    )
-    base = np.concatenate([wall[flat.base].ravel(), sheet[free[flat.base[free]]].ravel()])
+    opened, on_base, in_disc, in_septum = _open_disc(septum, rings, around, strips, grading)
+    septal, free = np.unique(opened.inner), np.setdiff1d(opened.inner, opened.line)
+    # Columns of nodes. The free wall's are -1 off it; along the line that it stands on, its nodes
+    # are the left wall's outermost.
+    wall = stacked(len(in_disc), through)
+    sheet = np.full((len(in_disc), strips + 1), -1)
+    sheet[opened.line] = wall[opened.levels, -1]
+    sheet[free] = wall.size + np.arange(len(free) * (strips + 1)).reshape(-1, strips + 1)
+    in_wall, in_sheet = _in_columns(wall, in_disc), _in_columns(sheet[septal], in_septum[septal])
+    on_wall = wall_midpoints(left, *in_wall.T)
+
+    def midpoints(edges: np.ndarray) -> np.ndarray:
+        of_sheet = (edges >= wall.size).any(axis=1)
+        result = np.empty((len(edges), 3))
+        result[of_sheet] = septum.sheet(*in_sheet[edges[of_sheet]].mean(axis=1).T)
+        result[~of_sheet] = on_wall(edges[~of_sheet])
+        return result
+
+    whole = np.concatenate([opened.inner, opened.outer, opened.band])
+    base = np.concatenate([wall[on_base].ravel(), sheet[free[on_base[free]]].ravel()])
     surfaces = {
         "lv_endocardium": wall[:, 0],
-        "rv_endocardium": np.concatenate([wall[np.unique(opened.inner), -1], sheet[free, 0]]),
+        "rv_endocardium": np.concatenate([wall[septal, -1], sheet[free, 0]]),
         "epicardium": np.concatenate([wall[np.unique(opened.outer), -1], sheet[free, -1]]),
         "base": base,
     }
     return body(
         np.concatenate([left.position(*in_wall.T), septum.sheet(*in_sheet[wall.size :].T)]),
-        elements,
+        np.concatenate([extrude(wall, whole), extrude(sheet, opened.inner)]),
         surfaces,
         {"base": base},
-        _midpoints(septum, in_wall, in_sheet),
+        midpoints,
         order,
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Flat:
-    """The opened disc.
+def _open_disc(
+    septum: Septum, rings: int, around: int, strips: int, grading: float
+) -> tuple[Footprint, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the disc opened around the septum, which takes half of ``around`` on full rings.
 
-    r, phi : coordinates of its vertices in the left wall, each (v,).
-    xi, eta : coordinates in the septum, each (v,); meaningless outside it.
-    base : (v,) bool, vertices on the base.
+    Also whether each vertex is on the base (v,), and its coordinates ``r``, ``phi`` in the left
+    wall and ``xi``, ``eta`` in the septum, each (v, 2); the latter mean nothing outside it. Septum
+    and band are in place, the other vertices moved smoothly.
     """
-
-    opened: Footprint
-    r: np.ndarray
-    phi: np.ndarray
-    xi: np.ndarray
-    eta: np.ndarray
-    base: np.ndarray
-
-    @property
-    def free(self) -> np.ndarray:
-        """Vertices of the septum off the line that the right free wall stands on."""
-        return np.setdiff1d(self.opened.inner, self.opened.line)
-
-
-def _open_disc(septum: Septum, rings: int, around: int, strips: int, grading: float) -> _Flat:
-    """Return the disc opened around the septum, which takes half of ``around`` on full rings."""
     radius, angle, triangles = disc(rings, around)
     angle = np.angle(np.exp(1j * angle))  # from -pi to pi
     columns, ring = around // 4, -(-around // 6)
@@ -282,76 +268,27 @@ def _open_disc(septum: Septum, rings: int, around: int, strips: int, grading: fl
     opened = open_sheet(triangles, inside, strips)
     rim = np.flatnonzero((radius == 1.0) & ~inside)
     xi, eta, r, phi = (part[opened.origin] for part in (xi, eta, radius, angle))
-    base = r == 1.0
+    on_base = r == 1.0
     r, eta = toward_base(r, grading), np.where(eta > 0.0, toward_base(eta, grading), eta)
-    r, phi = _disc_coordinates(septum, opened, rim, half_angle, xi, eta, r, phi)
-    return _Flat(opened, r, phi, xi, eta, base)
-
-
-def _disc_coordinates(
-    septum: Septum,
-    opened: Footprint,
-    rim: np.ndarray,
-    half_angle: float,
-    xi: np.ndarray,
-    eta: np.ndarray,
-    r: np.ndarray,
-    phi: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``r``, ``phi`` with septum and band in place, the other vertices moved smoothly."""
-    points = _polar(r, phi)
-    r, phi = r.copy(), phi.copy()
+    points = polar(r, phi)
     septal, band = np.unique(opened.inner), opened.levels[:, 1:]
     r[septal], phi[septal] = septum.foot(xi[septal], eta[septal], np.zeros(1))
-    r[band], phi[band] = septum.foot(xi[band], eta[band], _depths(band.shape[1])[1:])
+    r[band], phi[band] = septum.foot(xi[band], eta[band], np.arange(1, strips + 1) / strips)
     share = (np.pi - np.abs(phi[rim])) / (np.pi - half_angle)
     phi[rim] = np.sign(phi[rim]) * (np.pi - share * (np.pi - septum.half_angle))
     fixed = np.concatenate([band[:, -1], rim])
-    x, y = spread(points, opened.outer, fixed, _polar(r[fixed], phi[fixed])).T
+    x, y = spread(points, opened.outer, fixed, polar(r[fixed], phi[fixed])).T
     rest = np.setdiff1d(opened.outer, fixed)
     r[rest], phi[rest] = np.hypot(x[rest], y[rest]), np.arctan2(y[rest], x[rest])
-    return r, phi
+    return opened, on_base, np.column_stack([r, phi]), np.column_stack([xi, eta])
 
 
-def _sheet(flat: _Flat, wall: np.ndarray, strips: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the columns (v, strips + 1) of the free wall's nodes, -1 off it, and coordinates.
+def _in_columns(columns: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Return coordinates (n, 3) of the nodes in ``columns`` (v, layers + 1): a place, and depth.
 
-    Along the line it stands on, its nodes are the left wall's outermost. Coordinates (n, 3) have a
-    row for every node of the body, zero off the free wall.
+    They have a row for every number up to the largest, zero for nodes in no column.
     """
-    opened, free = flat.opened, flat.free
-    sheet = np.full((len(flat.r), strips + 1), -1)
-    sheet[opened.line] = wall[opened.levels, -1]
-    sheet[free] = wall.size + np.arange(len(free) * (strips + 1)).reshape(-1, strips + 1)
-    septal = np.unique(opened.inner)
-    return sheet, _in_columns(sheet[septal], flat.xi[septal], flat.eta[septal])
-
-
-def _in_columns(columns: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return coordinates (n, 3) of nodes in columns: ``first``, ``second`` and depth."""
     coordinates = np.zeros((columns.max() + 1, 3))
-    coordinates[columns, 0], coordinates[columns, 1] = first[:, None], second[:, None]
-    coordinates[columns, 2] = _depths(columns.shape[1] - 1)
+    coordinates[columns, :2] = places[:, None]
+    coordinates[columns, 2] = np.arange(columns.shape[1]) / (columns.shape[1] - 1)
     return coordinates
-
-
-def _midpoints(septum: Septum, in_wall: np.ndarray, in_sheet: np.ndarray) -> Midpoints:
-    """Return the function of midpoints in the left wall's or, on it, the sheet's coordinates."""
-    on_wall = wall_midpoints(septum.left, *in_wall.T)
-
-    def midpoints(edges: np.ndarray) -> np.ndarray:
-        of_sheet = (edges >= len(in_wall)).any(axis=1)
-        result = np.empty((len(edges), 3))
-        result[of_sheet] = septum.sheet(*in_sheet[edges[of_sheet]].mean(axis=1).T)
-        result[~of_sheet] = on_wall(edges[~of_sheet])
-        return result
-
-    return midpoints
-
-
-def _depths(layers: int) -> np.ndarray:
-    return np.arange(layers + 1) / layers
-
-
-def _polar(r: np.ndarray, phi: np.ndarray) -> np.ndarray:
-    return np.column_stack([r * np.cos(phi), r * np.sin(phi)])

@@ -19,15 +19,11 @@ def body(
     midpoints: Midpoints | None,
     order: int,
 ) -> Mesh:
-    """Return the mesh of a body, its elements oriented.
+    """Return the mesh of a body, linear or quadratic by ``order``, its elements oriented.
 
-    Parameters
-    ----------
     nodes, elements : (n, 3) mm and (m, 4), any orientation.
     surfaces : name -> nodes; a surface triangle belongs to the set that has its three corners.
-    node_sets : name -> nodes.
     midpoints : positions of the mid-edge nodes; ``None`` for straight edges.
-    order : 1 for linear, 2 for quadratic tetrahedra.
     """
     if order not in (1, 2):
         raise InputError(f"mesh: order {order}; expected 1 or 2")
@@ -39,19 +35,12 @@ def body(
 
 
 def extrude(columns: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Return three tetrahedra for each prism between two layers of a triangulation.
+    """Return three tetrahedra, not oriented, for each prism of ``triangles`` (k, 3) in a layer.
 
     A prism's corners are taken in the order of their 2D numbers, so the two prisms that share a
     side cut it along the same diagonal: from the lower number below to the higher number above.
 
-    Parameters
-    ----------
     columns : (v, layers + 1) 3D node at each 2D vertex and layer.
-    triangles : (k, 3) 2D vertices.
-
-    Returns
-    -------
-    (3 k layers, 4) elements, not oriented.
     """
     lower, upper = columns[:, :-1], columns[:, 1:]
     a, b, c = np.sort(triangles, axis=1).T

@@ -11,14 +11,7 @@ from emulator.core.errors import InputError
 from emulator.geometry.generators.body import body, extrude, stacked
 from emulator.geometry.mesh import Mesh
 
-_FACES = (
-    ("left", 0, 0),
-    ("right", 0, 1),
-    ("front", 1, 0),
-    ("back", 1, 1),
-    ("bottom", 2, 0),
-    ("top", 2, 1),
-)
+_X, _Y, _Z = ("left", "right"), ("front", "back"), ("bottom", "top")  # faces of a box
 
 
 def toward_ends(count: int, grading: float, ends: tuple[str, ...]) -> np.ndarray:
@@ -56,8 +49,7 @@ def box(
 
     Parameters
     ----------
-    lengths : the edge lengths, mm.
-    cells : number of cells along x, y, z.
+    lengths, cells : mm and number of cells along x, y, z.
     order : the order of the elements, 1 or 2.
     along : (cells[0] + 1,) ends of the cells along x as fractions of its length, see
         :func:`toward_ends`; even by default.
@@ -79,8 +71,9 @@ def box(
     rank = np.argsort(listed)
     nodes, elements = nodes[listed], rank[elements]
     sets = {
-        name: np.flatnonzero(nodes[:, axis] == (axes[axis][0], axes[axis][-1])[end])
-        for name, axis, end in _FACES
+        name: np.flatnonzero(x == end)
+        for names, x, ends in zip((_X, _Y, _Z), nodes.T, axes, strict=True)
+        for name, end in zip(names, ends[[0, -1]], strict=True)
     }
     return body(nodes, elements, sets, sets, None, order)
 
@@ -116,20 +109,16 @@ def slab(
     if min(cells) < 1 or not thickness > 0.0:
         raise InputError(f"slab: cells {cells} and thickness {thickness} mm must be positive")
     square, triangles = _crossed_square(*cells)
-    plane = _bilinear(_check_corners(corners), square)
-    nodes = np.concatenate(
-        [np.column_stack([plane, np.full(len(plane), z)]) for z in (0, thickness)]
-    )
-    across, up = np.tile(square, (2, 1)).T
-    on = {
-        "left": across == 0.0,
-        "right": across == 1.0,
-        "bottom": up == 0.0,
-        "top": up == 1.0,
-        "front": nodes[:, 2] == 0.0,
-        "back": nodes[:, 2] > 0.0,
+    across, up = square.T
+    weights = [(1 - across) * (1 - up), across * (1 - up), across * up, (1 - across) * up]
+    plane = np.stack(weights, axis=1) @ _check_corners(corners)
+    layer = np.repeat((0.0, 1.0), len(plane))
+    nodes = np.column_stack([np.tile(plane, (2, 1)), thickness * layer])
+    surfaces = {
+        name: np.flatnonzero(x == end)
+        for names, x in zip((_X, _Z, _Y), (*np.tile(square, (2, 1)).T, layer), strict=True)
+        for end, name in enumerate(names)
     }
-    surfaces = {name: np.flatnonzero(mask) for name, mask in on.items()}
     mesh = body(nodes, extrude(stacked(len(plane), 1), triangles), surfaces, surfaces, None, order)
     return replace(mesh, node_sets={**mesh.node_sets, "all": np.arange(len(mesh.nodes))})
 
@@ -152,13 +141,6 @@ def _check_corners(corners: tuple[Corner, ...]) -> np.ndarray:
             f"slab: corners {corners} are not a convex quadrilateral; expected them anticlockwise"
         )
     return points
-
-
-def _bilinear(corners: np.ndarray, square: np.ndarray) -> np.ndarray:
-    """Return the points (v, 2) of the quadrilateral at coordinates (v, 2) of the unit square."""
-    across, up = square.T
-    weights = [(1 - across) * (1 - up), across * (1 - up), across * up, (1 - across) * up]
-    return np.stack(weights, axis=1) @ corners
 
 
 def _crossed_square(across: int, up: int) -> tuple[np.ndarray, np.ndarray]:

@@ -20,23 +20,16 @@ from emulator.geometry.mesh import Mesh
 from emulator.geometry.refinement import Midpoints
 
 
-def ring_counts(rings: int, around: int) -> np.ndarray:
-    """Return the points on each ring, (rings,): six more each time, up to ``around``."""
-    if rings < 2 or around < 6:
-        raise InputError(f"disc: {rings} rings of {around} points; expected at least 2 and 6")
-    return np.minimum(6 * np.arange(1, rings + 1), around)
-
-
 def disc(rings: int, around: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return rings of points with the centre as vertex 0.
+    """Return rings of points with the centre as vertex 0: six more on each, up to ``around``.
 
-    Returns
-    -------
     radius : the radius (v,) from 0 at the centre to 1 on the outermost ring.
     angle : the polar angle (v,) in [0, 2 pi), zero at the centre.
     triangles : the vertices (k, 3) of triangles, anticlockwise.
     """
-    counts = ring_counts(rings, around)
+    if rings < 2 or around < 6:
+        raise InputError(f"disc: {rings} rings of {around} points; expected at least 2 and 6")
+    counts = np.minimum(6 * np.arange(1, rings + 1), around)
     first = np.concatenate([[1], 1 + np.cumsum(counts)])
     radius = np.repeat(np.arange(rings + 1) / rings, np.concatenate([[1], counts]))
     angles = [np.arange(count) * (2.0 * np.pi / count) for count in counts]
@@ -47,6 +40,11 @@ def disc(rings: int, around: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return radius, np.concatenate([[0.0], *angles]), np.concatenate([np.array(fan), *between])
 
 
+def polar(r: np.ndarray, phi: np.ndarray) -> np.ndarray:
+    """Return points (v, 2) of the disc."""
+    return np.column_stack([r * np.cos(phi), r * np.sin(phi)])
+
+
 def _zip(first_inner: int, inner: int, first_outer: int, outer: int) -> np.ndarray:
     """Return triangles between two rings, always advancing to the point of smaller angle.
 
@@ -54,18 +52,14 @@ def _zip(first_inner: int, inner: int, first_outer: int, outer: int) -> np.ndarr
     disc and the outer on the other: the triangulation is its own mirror image in the line of angle
     zero.
     """
-    triangles, i, j = [], 0, 0
-    while i < inner or j < outer:
-        lead = (i + 1) * outer - (j + 1) * inner
-        inner_next = lead < 0 or (lead == 0 and (inner < outer or 2 * (i + 1) <= inner))
-        a, b = first_inner + i % inner, first_outer + j % outer
-        if inner_next:
-            i += 1
-            triangles.append((a, b, first_inner + i % inner))
-        else:
-            j += 1
-            triangles.append((a, b, first_outer + j % outer))
-    return np.array(triangles)
+    i, j = np.arange(1, inner + 1), np.arange(1, outer + 1)
+    turn = np.concatenate([i * outer, j * inner])
+    rank = np.concatenate([np.where((inner == outer) & (2 * i > inner), 2, 0), np.ones(outer)])
+    on_inner = np.lexsort((rank, turn)) < inner  # the ring of each next point
+    i, j = np.cumsum(on_inner), np.cumsum(~on_inner)
+    a, b = first_inner + (i - on_inner) % inner, first_outer + (j - ~on_inner) % outer
+    c = np.where(on_inner, first_inner + i % inner, first_outer + j % outer)
+    return np.column_stack([a, b, c])
 
 
 _MOST_UNEVEN = 0.5  # beyond, the thin side of a thick-walled ventricle is too thin to mesh
@@ -173,11 +167,17 @@ def truncated_ellipsoid(
     """
     if layers < 1:
         raise InputError(f"ellipsoid: {layers} layers through the wall; expected at least 1")
+    more, towards = thicker
+    if not 0.0 <= more <= _MOST_UNEVEN or not np.isfinite(towards):
+        raise InputError(
+            f"ellipsoid: a wall thicker by {more} towards {towards} degrees; expected a fraction "
+            f"of 0 to {_MOST_UNEVEN} and an angle"
+        )
     radius, angle, triangles = disc(rings, around)
     radius = toward_base(radius, grading)
     r, phi = np.tile(radius, layers + 1), np.tile(angle, layers + 1)
     t = np.repeat(np.arange(layers + 1) / layers, len(radius))
-    depth = t * _thickness(r, phi, *thicker)
+    depth = t * (1.0 + more * r * np.cos(phi - np.radians(towards)))
     base = np.flatnonzero(r == 1.0)
     apex = np.flatnonzero(r == 0.0)
     surfaces = {
@@ -195,16 +195,6 @@ def truncated_ellipsoid(
     )
 
 
-def _thickness(r: np.ndarray, phi: np.ndarray, more: float, angle: float) -> np.ndarray:
-    """Return the relative thickness of the wall at ``r`` and ``phi``, 1 at the apex."""
-    if not 0.0 <= more <= _MOST_UNEVEN or not np.isfinite(angle):
-        raise InputError(
-            f"ellipsoid: a wall thicker by {more} towards {angle} degrees; expected a fraction of "
-            f"0 to {_MOST_UNEVEN} and an angle"
-        )
-    return 1.0 + more * r * np.cos(phi - np.radians(angle))
-
-
 def wall_midpoints(
     wall: EllipsoidalWall, r: np.ndarray, phi: np.ndarray, t: np.ndarray
 ) -> Midpoints:
@@ -213,7 +203,7 @@ def wall_midpoints(
     Halfway in the disc with polar coordinates r and phi, where the apex is no special point; for
     edges on the disc's rim, which is the base, halfway along the rim.
     """
-    disc_points = np.column_stack([r * np.cos(phi), r * np.sin(phi)])
+    disc_points = polar(r, phi)
 
     def midpoints(edges: np.ndarray) -> np.ndarray:
         x, y = disc_points[edges].mean(axis=1).T

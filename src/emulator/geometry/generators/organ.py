@@ -73,12 +73,6 @@ def organ(
     )
 
 
-def volume(half_axes: tuple[float, float, float]) -> float:
-    """Return the volume of the true body in mm3."""
-    a, b, c = half_axes
-    return 4.0 / 3.0 * np.pi * a * b * c * (1.0 + _TAPER_Y * _TAPER_Z / 5.0)
-
-
 def _in_ligament(directions: np.ndarray, shells: int, clustering: float) -> np.ndarray:
     """Return whether each unit vector (k, 3) meets the ligament before the map, (k,) bool."""
     nodes, elements = ball(shells)

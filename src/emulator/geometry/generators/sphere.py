@@ -15,17 +15,11 @@ from emulator.geometry.refinement import Midpoints
 def triangle_lattice(divisions: int) -> tuple[np.ndarray, np.ndarray]:
     """Return a triangle cut into ``divisions**2``: barycentric points (v, 3), triangles (k, 3)."""
     n = divisions
-    corners = [(i, j) for i in range(n + 1) for j in range(n + 1 - i)]
-    number = {corner: k for k, corner in enumerate(corners)}
-    upright = [(number[i, j], number[i + 1, j], number[i, j + 1]) for i, j in corners if i + j < n]
-    between = [
-        (number[i + 1, j], number[i + 1, j + 1], number[i, j + 1])
-        for i, j in corners
-        if i + j < n - 1
-    ]
-    steps = np.array(corners)
-    barycentric = np.column_stack([steps, n - steps.sum(axis=1)]) / n
-    return barycentric, np.array(upright + between)
+    i, j = np.array([(i, j) for i in range(n + 1) for j in range(n + 1 - i)]).T
+    here, ahead = np.arange(len(i)), np.arange(len(i)) + n + 1 - i  # places of (i, j), (i + 1, j)
+    upright = np.column_stack([here, ahead, here + 1])[i + j < n]
+    between = np.column_stack([ahead, ahead + 1, here + 1])[i + j < n - 1]
+    return np.column_stack([i, j, n - i - j]) / n, np.concatenate([upright, between])
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
@@ -49,12 +43,9 @@ def ball_midpoints(nodes: np.ndarray) -> Midpoints:
 
 
 def ball(shells: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the unit ball of tetrahedra in ``shells`` shells, each a subdivided icosahedron.
+    """Return nodes (n, 3) of the unit ball in ``shells`` shells, each a subdivided icosahedron.
 
-    Returns
-    -------
-    nodes : (1 + sum of 10 k^2 + 2 over the shells, 3).
-    elements : the tetrahedra (20 shells^3, 4), not oriented.
+    Shell k has 10 k^2 + 2 nodes. Also the tetrahedra (20 shells^3, 4), not oriented.
     """
     corners, faces = _icosahedron()
     steps, cells = _kuhn_lattice(shells)
@@ -74,11 +65,7 @@ def _icosahedron() -> tuple[np.ndarray, np.ndarray]:
     half = np.array([(0.0, a, b * golden) for a in (-1.0, 1.0) for b in (-1.0, 1.0)])
     corners = unit(np.concatenate([np.roll(half, turn, axis=1) for turn in range(3)]))
     adjacent = corners @ corners.T > 0.4  # neighbours' directions have cosine 1 / sqrt(5)
-    faces = [
-        (a, b, c)
-        for a, b, c in combinations(range(12), 3)
-        if adjacent[a, b] and adjacent[b, c] and adjacent[a, c]
-    ]
+    faces = [each for each in combinations(range(12), 3) if adjacent[np.ix_(each, each)].all()]
     return corners, np.array(faces)
 
 
@@ -124,17 +111,12 @@ def sphere_octant(
     along, through = cells
     barycentric, triangles = triangle_lattice(along)
     directions = unit(barycentric)
-    radii = _radii(inner, outer, through, grading)
+    thickness = grading ** np.linspace(0.0, 1.0, through)
+    within = np.concatenate([[0.0], np.cumsum(thickness)]) / thickness.sum()
+    radii = inner + (outer - inner) * within
     nodes = (radii[:, None, None] * directions).reshape(-1, 3)
     level = np.repeat(np.arange(through + 1), len(directions))
     sets = {name: np.flatnonzero(nodes[:, axis] == 0.0) for axis, name in enumerate("xyz")}
     sets |= {"inner": np.flatnonzero(level == 0), "outer": np.flatnonzero(level == through)}
     elements = extrude(stacked(len(directions), through), triangles)
     return body(nodes, elements, sets, sets, ball_midpoints(nodes), order)
-
-
-def _radii(inner: float, outer: float, through: int, grading: float) -> np.ndarray:
-    """Return the radii of the layers, (through + 1,) mm."""
-    thickness = grading ** np.linspace(0.0, 1.0, through)
-    within = np.concatenate([[0.0], np.cumsum(thickness)]) / thickness.sum()
-    return inner + (outer - inner) * within

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from emulator.core.errors import InputError
+from emulator.geometry.discretisation import dihedral_angles
 from emulator.geometry.generators.biventricle import RightVentricle, Septum, biventricle
 from emulator.geometry.generators.ellipsoid import HUMAN
-from emulator.geometry.quality import dihedral_angles
 from geometry_support import assert_sound, order_of, volume
 
 

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from emulator.core.errors import InputError
+from emulator.geometry.discretisation import dihedral_angles
 from emulator.geometry.generators.ellipsoid import (
     HUMAN,
     LAND,
@@ -10,7 +11,6 @@ from emulator.geometry.generators.ellipsoid import (
     land_ventricle,
     truncated_ellipsoid,
 )
-from emulator.geometry.quality import dihedral_angles
 from geometry_support import assert_sound, order_of, volume
 
 

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from emulator.core.errors import InputError
+from emulator.geometry.discretisation import dihedral_angles
 from emulator.geometry.generators.sphere import sphere_octant
-from emulator.geometry.quality import dihedral_angles
 from geometry_support import assert_sound, order_of, volume
 
 
