@@ -61,7 +61,6 @@ def run_options(*more: str) -> Option:
 
 def _add_run(parser: ArgumentParser, more: Sequence[str]) -> None:
     from calibrate.project.run import Run
-    from calibrate.samplers import SAMPLERS
     from emulator.core.docstrings import documented
 
     add_scene(parser, "; or an experiment file, whose entries the options replace")
@@ -82,6 +81,8 @@ def _add_run(parser: ArgumentParser, more: Sequence[str]) -> None:
             elif word.read is not None:
                 about |= {"nargs": "+", "default": []}
             elif name == "sampler":
+                from calibrate.samplers import SAMPLERS
+
                 about, text = {"choices": tuple(SAMPLERS)}, f"default {default}"
             elif hints[name] is int:
                 about = {"type": int, "metavar": "N"}

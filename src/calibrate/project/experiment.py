@@ -25,22 +25,8 @@ file:
     shift = 2.0                              # mm
     turn = 1.5                               # degrees
 
-Members of one population have a table each; keys outside of these tables hold for all members:
-
-.. code-block:: toml
-
-    scene = "heart.toml"
-    noise = {volume = 2.0}
-
-    [members.first]
-    data = "first.csv"
-
-    [members.second]
-    scene = "second.toml"
-    data = "second.csv"
-
-    [population]
-    shared = ["a", "b"]
+Members of one population have a table ``[members.NAME]`` each; keys outside of these tables hold
+for all members, and ``[population]`` is a :class:`~calibrate.project.members.Shared`.
 
 The JSON Schema, for editors that complete and check TOML, has the keys, types and descriptions of
 the run, of the dataclasses in the registries of noises, systematic errors and samplers, and of the

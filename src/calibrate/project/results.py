@@ -117,13 +117,7 @@ def _remove(folder: Path, names: tuple[str, ...]) -> None:
 
 
 def load(folder: str | Path) -> Posterior:
-    """Read the posterior that :func:`calibrate.project.infer`, or ``calibrate infer``, wrote.
-
-    Raises
-    ------
-    InputError
-        As :func:`read_posterior`.
-    """
+    """Return the posterior of :func:`read_posterior`, which ``calibrate infer`` wrote."""
     return read_posterior(folder)[1]
 
 

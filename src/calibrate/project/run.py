@@ -11,18 +11,20 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from calibrate.measurements import DISPLACEMENT, Observations
 from calibrate.model_error.kinds import read_systematic
 from calibrate.noise import Noise, noise_of, with_discrepancy
 from calibrate.priors import Population
-from calibrate.samplers import Sampler, find_sampler, options_from
 from calibrate.state_names import split
 from calibrate.statistical_model import at_sites
 from emulator.core.errors import InputError
 from emulator.core.schema import read_json_as
 from emulator.surrogates import registry, shipped
+
+if TYPE_CHECKING:
+    from calibrate.samplers import Sampler
 
 SYNTHETIC = "synthetic"
 """The word for data that FEM makes."""
@@ -135,6 +137,8 @@ class Run:
         InputError
             The sampler is unknown, or it has no such option.
         """
+        from calibrate.samplers import find_sampler, options_from  # ArviZ takes a second
+
         sampler = find_sampler(self.sampler)
         length = {"warmup": self.warmup, "draws": self.draws, "chains": self.chains}
         return sampler, options_from(sampler, self.sampler_options, **length)

@@ -6,9 +6,9 @@ import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import plotly.graph_objects as go
@@ -30,16 +30,11 @@ _COLOURS = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Verdict:
+class Verdict(NamedTuple):
     """The box at the top of a page.
 
-    Parameters
-    ----------
-    text : the verdict in one or two words.
-    colour : one of :data:`GOOD`, :data:`UNSURE` and :data:`BAD`.
-    findings : the sentences below the verdict.
-    basis : the sentence that says what the verdict rests on.
+    text : the verdict in one or two words, on :data:`GOOD`, :data:`UNSURE` or :data:`BAD`.
+    findings : the sentences below the verdict. basis : what the verdict rests on.
     warnings : the sentences about the run, shown below the box.
     """
 
