@@ -129,13 +129,7 @@ def add_scene(parser: ArgumentParser, more: str = "") -> None:
 
 
 def scene_words(arguments: Namespace) -> tuple[str, str | None]:
-    """Return the name and the folder that :func:`add_scene` read.
-
-    Raises
-    ------
-    InputError
-        A folder is given, and the scene is not a published one.
-    """
+    """Return the name and the folder (of published scenes) that :func:`add_scene` read."""
     is_published = arguments.scene.removeprefix("finer:").startswith("published:")
     if arguments.root is not None and not is_published:
         raise InputError(

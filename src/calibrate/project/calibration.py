@@ -86,12 +86,7 @@ def certify_and_keep(
     reweight_to : the folder that the reweighted posterior is written to, ready to be certified in
         its turn, where the verdict allows it (:func:`calibrate.certificate.check.can_reweight`).
     options : the numbers of FEM runs, and where they are solved, as of
-        :func:`calibrate.certificate.examine`.
-
-    Raises
-    ------
-    InputError
-        FEM has decided on the draws already.
+        :func:`calibrate.certificate.examine`, with its errors.
     """
     simulator = simulator_of(posterior.model.forward.scene, load_steps)
     check = examine(posterior, simulator, **options)

@@ -136,10 +136,7 @@ def naming(where: str) -> Iterator[None]:
 def with_data(problem: Problem) -> Problem:
     """Return the problem with its data; FEM at the truth plus noise if the data is synthetic.
 
-    Raises
-    ------
-    InputError
-        The truth names no such parameter, lacks one, or is outside the scene's range.
+    :class:`InputError` for a truth that is incomplete, too long, or outside the scene's range.
     """
     if problem.data is not None:
         return problem

@@ -54,14 +54,7 @@ _SHOWN = 4  # largest number of a folder's files that an error names
 
 @contextmanager
 def reserved(folder: Path, results: tuple[str, ...] = _RESULTS, *, force: bool) -> Iterator[None]:
-    """Reserve ``folder`` for one run of one process.
-
-    Raises
-    ------
-    InputError
-        The folder has results of an earlier run and there is no ``force``, or another process is
-        writing to it.
-    """
+    """Reserve ``folder`` for one run of one process; ``results`` are replaced by ``force`` only."""
     with exclusive(folder / RUN, "run"):
         present = [name for name in results if (folder / name).exists()]
         if present and not force:
@@ -165,13 +158,7 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
 
 
 def holds_population(folder: str | Path) -> bool:
-    """Return whether ``folder`` has the results of a population instead of one run's.
-
-    Raises
-    ------
-    InputError
-        It has neither.
-    """
+    """Return whether ``folder`` has the results of a population; it has those or one run's."""
     path = Path(folder) / RUN
     if not path.is_file():
         raise InputError(

@@ -130,13 +130,7 @@ class Run:
         return self.data == SYNTHETIC
 
     def sampling(self) -> tuple[Sampler, Any]:
-        """Return the sampler and its options.
-
-        Raises
-        ------
-        InputError
-            The sampler is unknown, or it has no such option.
-        """
+        """Return the sampler and its options; :class:`InputError` for an unknown one of either."""
         from calibrate.samplers import find_sampler, options_from  # ArviZ takes a second
 
         sampler = find_sampler(self.sampler)
