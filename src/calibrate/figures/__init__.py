@@ -42,6 +42,11 @@ def pyplot() -> Any:
     return plt
 
 
+def with_unit(name: str, unit: str) -> str:
+    """Return a label: the name, and its unit in brackets if it has one."""
+    return name if unit in ("", "1") else f"{name} ({unit})"
+
+
 def panels(
     count: int,
     columns: int,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibrate.figures import draw_body, panels, pyplot, save
+from calibrate.figures import draw_body, panels, pyplot, save, with_unit
 from emulator.accuracy.comparison import UNITS, Errors, log_density, quantiles
 from emulator.geometry.facets import flat_triangles
 from emulator.geometry.mesh import Mesh
@@ -118,7 +118,7 @@ def _draw_map(scene: Scene, cases: list[Any]) -> Any:
     axes.add_patch(Rectangle((x.low, y.low), *size, fill=False, ls="--", lw=1.0))
     if len(cases) > 1:
         figure.legend(loc="outside lower center", ncols=2, frameon=False)
-    axes.set(xlabel=_name(x), ylabel=_name(y))
+    axes.set(xlabel=with_unit(x.name, x.unit), ylabel=with_unit(y.name, y.unit))
     _scale(axes.set_xscale, axes.xaxis, x)
     _scale(axes.set_yscale, axes.yaxis, y)
     return figure
@@ -136,7 +136,7 @@ def _draw_panels(scene: Scene, cases: list[Any]) -> Any:
                 label=label,
             )  # fmt: skip
         axes.axvspan(parameter.low, parameter.high, color="0.93", zorder=0)
-        axes.set(xlabel=_name(parameter), yscale="log")
+        axes.set(xlabel=with_unit(parameter.name, parameter.unit), yscale="log")
         _scale(axes.set_xscale, axes.xaxis, parameter)
     _plain(grid[0, 0].yaxis, (1.0, 2.0, 5.0))  # shared
     for axes in grid[:, 0]:
@@ -147,10 +147,6 @@ def _draw_panels(scene: Scene, cases: list[Any]) -> Any:
             loc="outside lower center", ncols=2, frameon=False,
         )  # fmt: skip
     return figure
-
-
-def _name(parameter: Parameter) -> str:
-    return f"{parameter.name} ({parameter.unit})" if parameter.unit else parameter.name
 
 
 def _scale(set_scale: Any, axis: Any, parameter: Parameter) -> None:

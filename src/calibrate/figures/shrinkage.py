@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calibrate.figures import BLUE, VERMILION, panels, save
+from calibrate.figures import BLUE, VERMILION, panels, save, with_unit
 from calibrate.population import Hierarchy
 from calibrate.population.posterior import ALONE
 
@@ -38,8 +38,7 @@ def intervals_of(population: Hierarchy, name: str, probability: float = 0.9) -> 
 
 def label_of(population: Hierarchy, name: str) -> str:
     """Return the label of a shared unknown: its name with its unit."""
-    unit = str(population.tree["posterior"][name].attrs.get("units", "1"))
-    return name if unit == "1" else f"{name} ({unit})"
+    return with_unit(name, str(population.tree["posterior"][name].attrs.get("units", "1")))
 
 
 def draw(population: Hierarchy, path: str | Path, probability: float = 0.9) -> None:

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from calibrate.analysis.identifiability import identify
-from calibrate.figures import draw_body, pyplot, save
+from calibrate.figures import draw_body, pyplot, save, with_unit
 from calibrate.measurements import DISPLACEMENT
 from calibrate.measurements.points import DisplacementPoints
 from calibrate.posterior import Posterior
@@ -124,8 +124,8 @@ def _draw_beam(
     )
     joint.plot(theta[first.name], theta[second.name], "k+", ms=14, mew=2, label="truth")
     joint.set(
-        xlabel=f"{first.name} ({first.unit})",
-        ylabel=f"{second.name} ({second.unit})",
+        xlabel=with_unit(first.name, first.unit),
+        ylabel=with_unit(second.name, second.unit),
         xlim=(first.low, first.high),
         ylim=(second.low, second.high),
         title="prior box and posterior",
@@ -192,8 +192,8 @@ def _draw_marginal(axes: Axes, posterior: Posterior, parameter: Any, truth: floa
     for quantile in np.quantile(draws, [0.05, 0.95]):
         axes.axvline(quantile, color=_POSTERIOR, lw=1, ls=":")
     axes.axvline(truth, color="black", lw=1.6, label="truth")
-    unit = f" ({parameter.unit})" if parameter.unit else ""
-    axes.set(xlabel=f"{parameter.name}{unit}", yticks=[], xlim=(parameter.low, parameter.high))
+    label = with_unit(parameter.name, parameter.unit)
+    axes.set(xlabel=label, yticks=[], xlim=(parameter.low, parameter.high))
 
 
 def _draw_volume(axes: Axes, posterior: Posterior, truth: np.ndarray, prior: jax.Array) -> None:

@@ -13,7 +13,7 @@ from plotly.subplots import make_subplots
 from scipy.stats import rankdata
 
 from calibrate.analysis.identifiability import stress_band
-from calibrate.figures import BLUE, COLOURS, VERMILION
+from calibrate.figures import BLUE, COLOURS, VERMILION, with_unit
 from calibrate.measurements import Observation
 from calibrate.measurements.klotz import klotz_of
 from calibrate.measurements.volume import PressureVolume, in_mmhg, pressure_volume
@@ -46,11 +46,7 @@ def inside(values: np.ndarray, data: np.ndarray) -> np.ndarray:
 def names_with_units(posterior: Posterior) -> dict[str, str]:
     """Return the label of each unknown, its unit included."""
     units = {p.name: p.unit for p in posterior.model.forward.scene.parameters}
-    labels = {}
-    for name in posterior.model.names:
-        unit = units.get(split(name)[0], "")
-        labels[name] = f"{name} ({unit})" if unit else name
-    return labels
+    return {n: with_unit(n, units.get(split(n)[0], "")) for n in posterior.model.names}
 
 
 def against_data(posterior: Posterior) -> Iterator[tuple[str, go.Figure]]:
