@@ -76,8 +76,11 @@ def solve() -> list[Frame]:
 NODES = "node,ux,uy,uz\n3,0.5,0.0,-9.0\n7,0.4,0.1,-5.0\n11,0.2,0.0,-2.0\n19,0.1,0.0,-7.0\n"
 
 
-def infer() -> None:
-    """Run ``calibrate infer`` on a data file, with the shipped emulator of the beam."""
+def infer(then: Callable[[str], object] = lambda _: None) -> None:
+    """Run ``calibrate infer`` on a data file, with the shipped emulator of the beam.
+
+    ``then`` is called with the folder of its results.
+    """
     from calibrate.cli import main
 
     with TemporaryDirectory() as folder:
@@ -85,6 +88,7 @@ def infer() -> None:
         data.write_text(NODES)
         words = ["once_clamped_beam", "--data", str(data), "--no-unit-check", "--no-certify"]
         main(["--no-cache", "infer", *words, "--out", f"{folder}/run"])
+        then(f"{folder}/run")
 
 
 def parse() -> list[Frame]:
@@ -125,11 +129,27 @@ def scene_file() -> list[Frame]:
         return journey(Scene, "__post_init__", lambda: main(words))
 
 
+def check() -> list[Frame]:
+    """Return the frames from ``calibrate certify`` to the FEM solve."""
+    import emulator as em
+    from calibrate.cli import main
+
+    frames: list[Frame] = []
+
+    def certify(folder: str) -> None:
+        words = ["--no-cache", "certify", folder, "--draws", "25", "--no-mesh"]
+        frames.extend(journey(em.Simulator, "solve", lambda: main(words)))
+
+    infer(certify)
+    return frames
+
+
 JOURNEYS: dict[str, Callable[[], list[Frame]]] = {
     "scene TOML to Scene": scene_file,
     "Simulator.solve to law.energy": solve,
     "calibrate infer to the data file": parse,
     "calibrate infer to the likelihood": likelihood,
+    "calibrate certify to Simulator.solve": check,
 }
 """Journeys by what they lead from and to."""
 

@@ -11,7 +11,7 @@ import pytest
 from calibrate.cli import COMMANDS, build_parser
 from calibrate.measurements import OBSERVATIONS
 from calibrate.noise import NOISES
-from calibrate.samplers.registry import SAMPLERS
+from calibrate.samplers import SAMPLERS
 from emulator.fem.formulations import FORMULATIONS
 from emulator.fem.linear import SOLVERS
 from emulator.mechanics.laws import LAWS

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calibrate.measurements import OBSERVATIONS
-from calibrate.samplers.registry import SAMPLERS
+from calibrate.samplers import SAMPLERS
 from emulator.fem import Status
 from emulator.mechanics.kinematics import Strain
 from emulator.mechanics.laws import LAWS

@@ -38,7 +38,7 @@ def parts_of(check: Check) -> dict[str, np.ndarray]:
     difference, in which the pool's error cancels.
     """
     names = check.posterior.model.names
-    here = check.predictive.constrain(check.pool.z)
+    here = check.pool.predictive.constrain(check.pool.z)
     x = np.stack([here[name] for name in names], axis=1)
     p, pool = len(names), check.pool
     corrected, cheap = pool.corrected, normalised(pool.log_cheap)

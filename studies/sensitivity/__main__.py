@@ -19,7 +19,7 @@ from studies.common.output import Case, Results, parser, save
 
 import calibrate as cal
 import emulator as em
-from calibrate.analysis.indices import Factors, analyse
+from calibrate.analysis.sensitivity import Factors, analyse
 from calibrate.figures import BLUE, GREEN, ORANGE, pyplot
 from calibrate.figures.sensitivity import body_figure
 from calibrate.measurements import CavityVolume, Observations, landmarks, spread_landmarks

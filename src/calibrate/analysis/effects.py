@@ -210,23 +210,19 @@ class Comparison:
 
     def of(self, names: tuple[str, ...], make: Callable[[], Scene]) -> Measured:
         """Return the comparison with another scene, whose parameters the whole one has, too."""
-        if names and () not in self._known:
+        if names in self._known:
+            return self._known[names]
+        if names:
             self.without(())
-        if names not in self._known:
-            if names not in self.simulators:
-                self.simulators[names] = Simulator(make())
-            self._say(f"without {', '.join(names)}" if names else "the scene as it is")
-            self._known[names] = self._measure(names, self.simulators[names])
-        return self._known[names]
-
-    def _measure(self, names: tuple[str, ...], simulator: Simulator) -> Measured:
+        if names not in self.simulators:
+            self.simulators[names] = Simulator(make())
+        self._say(f"without {', '.join(names)}" if names else "the scene as it is")
+        simulator, whole = self.simulators[names], self.simulators[()]
         simpler = simulator.scene
         onto = Onto(self._scene, simpler)
-        thetas = onto.theta(self._thetas)
         first, _ = _clocked(simulator, simpler.centre)
-        whole = self.simulators[()]
-        values, times, ratios = [], [], []
-        for own, theta in zip(thetas, self._thetas, strict=True):
+        values, times, ratios, status = [], [], [], Status.CONVERGED
+        for own, theta in zip(onto.theta(self._thetas), self._thetas, strict=True):
             # Solvers keep factors of values they have seen: not the theta of the comparison again.
             whole_seconds = _clocked(whole, theta * (1.0 + _ASIDE))[0] if names else None
             seconds, solution = _clocked(simulator, own)
@@ -234,41 +230,30 @@ class Comparison:
             ratios.append(1.0 if whole_seconds is None else seconds / whole_seconds)
             status = Status(int(solution.status))
             if status is not Status.CONVERGED:
-                if not names:
-                    raise SolverError(f"effects: FEM of scene '{simpler.name}': {status.text}")
-                never = dict.fromkeys(self._observe.parts, float("inf"))
-                return self._row(names, status.text, never, (times, ratios), first, simulator)
+                break
             u = onto.field(solution.displacement)[self._observe.nodes]
             seen = self._observe(u[None], theta[None])
             values.append({name: np.asarray(value) for name, value in seen.items()})
+        changes = dict.fromkeys(self._observe.parts, float("inf"))
         if not names:
+            if status is not Status.CONVERGED:
+                raise SolverError(f"effects: FEM of scene '{simpler.name}': {status.text}")
             self._values = values
-        pairs = list(zip(values, self._values, strict=True))
-        changes = {
-            name: max(_largest(mine[name] - its[name]) for mine, its in pairs)
-            for name in self._observe.parts
-        }
-        return self._row(names, Status.CONVERGED.text, changes, (times, ratios), first, simulator)
-
-    def _row(
-        self,
-        names: tuple[str, ...],
-        status: str,
-        changes: Mapping[str, float],
-        times: tuple[list[float], list[float]],
-        first: float,
-        simulator: Simulator,
-    ) -> Measured:
-        return Measured(
+        if status is Status.CONVERGED:
+            pairs = list(zip(values, self._values, strict=True))
+            for name in changes:
+                changes[name] = max(_largest(mine[name] - its[name]) for mine, its in pairs)
+        self._known[names] = Measured(
             left_out=names,
-            status=status,
+            status=status.text,
             changes=changes,
-            seconds=float(np.median(times[0])),
-            ratio=float(np.median(times[1])),
+            seconds=float(np.median(times)),
+            ratio=float(np.median(ratios)),
             first_s=first,
-            unknowns=int((~simulator.scene.held).sum()),
-            operations=operations(simulator.scene),
+            unknowns=int((~simpler.held).sum()),
+            operations=operations(simpler),
         )
+        return self._known[names]
 
 
 def _clocked(simulator: Simulator, theta: jax.Array) -> tuple[float, Solution]:

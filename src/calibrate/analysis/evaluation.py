@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from emulator.accuracy.comparison import Errors, case_errors
@@ -20,36 +20,6 @@ OUR_FEM = "fem"
 _CASES = 50
 
 
-@dataclass(frozen=True)
-class Evaluation:
-    """What to evaluate against what.
-
-    emulator : shipped name or folder; its scene is the one evaluated.
-    against : ``fem``, or the folder of a published model's data.
-    cases : FEM runs against ``fem``, inside the box and again outside; 50 by default.
-    outside : fraction of each side by which the box is widened for the cases outside; ``None``
-        for no such cases.
-    forward, forward_options : a name of :data:`emulator.surrogates.registry.FORWARD_MAPS`, and its
-        options by name, e.g. ``{"steps": 2}``.
-    """
-
-    emulator: str
-    against: str = OUR_FEM
-    cases: int | None = None
-    outside: float | None = None
-    forward: str = "emulator"
-    forward_options: Mapping[str, int] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        full_options(self.forward, self.forward_options)
-        if self.cases is not None and self.against != OUR_FEM:
-            raise InputError("cases: every released one is compared; use --against fem for others")
-        if self.outside is not None and self.against != OUR_FEM:
-            raise InputError("outside: nothing was released outside the box; use --against fem")
-        if self.outside is not None and not 0.0 < self.outside < float("inf"):
-            raise InputError(f"outside is {self.outside}; give a fraction above 0, e.g. 0.25")
-
-
 @dataclass(frozen=True, eq=False)
 class Evaluated:
     """The map, its errors inside the box and, if asked for, outside, and the report as JSON."""
@@ -60,8 +30,27 @@ class Evaluated:
     report: Mapping[str, Any]
 
 
-def run_evaluation(plan: Evaluation, *, progress: bool = False) -> Evaluated:
+def run_evaluation(
+    emulator: str,
+    *,
+    against: str = OUR_FEM,
+    cases: int | None = None,
+    outside: float | None = None,
+    forward: str = "emulator",
+    forward_options: Mapping[str, int] = {},
+    progress: bool = False,
+) -> Evaluated:
     """Solve or read the reference solutions, and compare the forward map with them.
+
+    Parameters
+    ----------
+    emulator : shipped name or folder; its scene is the one evaluated.
+    against : ``fem``, or the folder of a published model's data.
+    cases : FEM runs against ``fem``, inside the box and again outside; 50 by default.
+    outside : fraction of each side by which the box is widened for the cases outside; ``None``
+        for no such cases.
+    forward, forward_options : a name of :data:`emulator.surrogates.registry.FORWARD_MAPS`, and its
+        options by name, e.g. ``{"steps": 2}``.
 
     Raises
     ------
@@ -70,34 +59,38 @@ def run_evaluation(plan: Evaluation, *, progress: bool = False) -> Evaluated:
     SolverError
         FEM fails inside the box.
     """
-    emulator = load(plan.emulator)
-    scene = emulator.scene
-    cases = _CASES if plan.cases is None else plan.cases
+    options = full_options(forward, forward_options)
+    if cases is not None and against != OUR_FEM:
+        raise InputError("cases: every released one is compared; use --against fem for others")
+    if outside is not None and against != OUR_FEM:
+        raise InputError("outside: nothing was released outside the box; use --against fem")
+    if outside is not None and not 0.0 < outside < float("inf"):
+        raise InputError(f"outside is {outside}; give a fraction above 0, e.g. 0.25")
+    trained = load(emulator)
+    scene, count = trained.scene, _CASES if cases is None else cases
     simulator = Simulator(scene)  # shared by references and forward map: it compiles once
-    if plan.against == OUR_FEM:
-        reference = fem_reference(simulator, cases, progress=progress)
+    if against == OUR_FEM:
+        reference = fem_reference(simulator, count, progress=progress)
     else:
-        reference = published_reference(scene, plan.against, progress=progress)
-    made_of = Ingredients(
-        scene, simulator, plan.emulator, seed=0, extrapolate=True, progress=progress
-    )
-    forward = build_forward(plan.forward, made_of, plan.forward_options)
-    inside = case_errors(forward, reference.thetas, reference.displacement)
+        reference = published_reference(scene, against, progress=progress)
+    made_of = Ingredients(scene, simulator, emulator, seed=0, extrapolate=True, progress=progress)
+    map_ = build_forward(forward, made_of, forward_options)
+    inside = case_errors(map_, reference.thetas, reference.displacement)
     report = {
         **inside.report(),
         "reference": reference.source,
         "scene": scene.name,
-        "emulator": plan.emulator,
-        "forward": plan.forward,
-        "forward_options": full_options(plan.forward, plan.forward_options),
-        "label": forward.label,
-        "training": dict(emulator.record),
+        "emulator": emulator,
+        "forward": forward,
+        "forward_options": options,
+        "label": map_.label,
+        "training": dict(trained.record),
     }
-    outside = None
-    if plan.outside is not None:
-        beyond = outside_reference(simulator, cases, plan.outside, reference, progress=progress)
-        outside, report["outside"] = _outside(forward, beyond, plan.outside)
-    return Evaluated(forward, inside, outside, report)
+    if outside is None:
+        return Evaluated(map_, inside, None, report)
+    beyond = outside_reference(simulator, count, outside, reference, progress=progress)
+    errors, report["outside"] = _outside(map_, beyond, outside)
+    return Evaluated(map_, inside, errors, report)
 
 
 def _outside(

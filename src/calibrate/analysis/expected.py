@@ -1,47 +1,92 @@
-r"""What data would determine, before there is any: posteriors of data that the prior expects.
+r"""What data would determine before there is any, and what to measure next.
 
-For each of some draws of the prior data is made, :math:`y_r \sim p(y \mid x_r)`, and the covariance
-of its posterior :math:`p(x \mid y_r)` is found by importance sampling, from draws of the prior and
-of a Student's t about a Newton step from :math:`x_r`,
+**Information.** With :math:`g(x)` the data without noise as a function of the unknowns
+:math:`x = \log\theta` (:math:`\theta` itself where it may be 0 or below), and S the covariance of
+the data about it, the data hold the Fisher information
+
+.. math:: F = J^T S^{-1} J, \qquad J = \partial g / \partial x, \qquad S = C + \alpha^2 V V^T
+
+about x, with the noise's covariance C and, where many numbers share errors, their modes V and
+size :math:`\alpha` (:mod:`calibrate.model_error.marginal`, which has :math:`S^{-1}` by
+Woodbury's identity). With a normal prior of covariance P the posterior's covariance is about
+:math:`(F + P^{-1})^{-1}`. S is in the data's units squared, F in one over those of x squared: none
+for :math:`\log\theta`. How S changes with x is left out of F. For noise that is not Gaussian
+:math:`C^{-1}` is the curvature :math:`-\partial^2_\mu \log p(y \mid \mu)` at :math:`y = \mu`: for
+Student's t somewhat more than its information.
+
+**Before data.** For each of some draws of the prior data is made,
+:math:`y_r \sim p(y \mid x_r)`, and the covariance of its posterior :math:`p(x \mid y_r)` is found
+by importance sampling, from draws of the prior and of a Student's t about a Newton step from
+:math:`x_r`,
 
 .. math:: w_i \propto \frac{p(x_i)\, p(y_r \mid x_i)}
                            {\beta\, p(x_i) + (1 - \beta)\, t_5(x_i;\, \hat x, Q)},
           \qquad Q = (F + P^{-1})^{-1},
 
-with the Fisher information F of :mod:`~calibrate.analysis.fisher`, the prior's
-covariance P and the share :math:`\beta` of draws from the prior; :math:`\hat x` and Q are
-then those of the weighted draws, and it is done again (Cappe et al. 2008; Owen and Zhou 2000).
+with the prior's covariance P and the share :math:`\beta` of draws from the prior; :math:`\hat x`
+and Q are then those of the weighted draws, and it is done again (Cappe et al. 2008; Owen and Zhou
+2000).
 If too few draws carry the weight, the covariance is Q. Posteriors are
 averaged, not informations: by Jensen's inequality the inverse of a mean information is less than
 the mean posterior covariance, and a box of a prior ends where a Gaussian does not.
 :math:`x = \log\theta` where all unknowns are positive, else :math:`\theta`.
 
-Errors that many numbers share are in the data and in :math:`p(y \mid x)`, which marginalises them
-(:mod:`~calibrate.analysis.fisher`). Where the size of one is inferred, each
+Data sets that are not measured yet differ in their shared errors: modes that depend on where points
+were seen, as pins' modes do, are made of the mean :math:`g(x_r)` of each set, so that the errors of
+all sets are one object with a leading axis. They are marginalised: y is Gaussian about g(x) with
+
+.. math:: S_r(\alpha) = C + V_r V_r^T + \alpha^2 U_r U_r^T, \qquad V_r = V(g(x_r)),
+
+the covariance of the noise, of errors of known size and of errors whose size :math:`\alpha` is
+inferred, in the data's units squared. An error that is a share of the prediction follows x itself.
+A fit to measured data does not know :math:`g(x_r)` and takes the data for it where points were seen
+(:mod:`calibrate.model_error.kinds`).
+
+Before data, a size that is inferred is integrated over its prior, with distribution function
+:math:`\Phi`, by K values that are equally probable:
+
+.. math:: p(y \mid x) = \frac1K \sum_{k=1}^K N\left(y;\, g(x),\, S_r(\alpha_k)\right), \qquad
+          \alpha_k = \Phi^{-1}\left(\tfrac{k - 1/2}{K}\right).
+
+Where the size of one is inferred, each
 data set has another quantile of its prior, and F is that of x at this size: about x and
 the size together Gaussian data has no information in common, so that not to know
 the size widens x in second order only.
+
+**Next measurement.** A candidate :math:`y' = g'(x) + \varepsilon'` with the information F' about x
+would add to the present posterior, of covariance C,
+
+.. math:: \Delta = \tfrac12 \log_2 \det\left(1 + C F'\right) \text{ bits},
+
+where the map is linear over the posterior (Lindley 1956; Chaloner and Verdinelli 1995). The gain is
+averaged over draws of the posterior; no data is simulated and no posterior sampled. A candidate has
+its own noise only: an error that it would share with the present data is not counted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro.distributions as dist
+from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import solve_triangular
-from jax.scipy.special import gammaln
+from jax.scipy.special import logsumexp
 
-from calibrate.analysis.fisher import Errors, information_at, log_ratio, of_each, sizes_of
 from calibrate.analysis.identifiability import combinations, prior_table
-from calibrate.model_error.marginal import ModelError
+from calibrate.measurements import Observation, Observations
+from calibrate.model_error.marginal import Means, ModelError
+from calibrate.noise import Noise, information_about_means
+from calibrate.posterior import Posterior
 from calibrate.statistical_model import Model
 from calibrate.statistical_model.errors import errors_of_data
 from emulator.core.errors import InputError
 
+_DRAWS = 32  # draws of a posterior over which a gain is averaged
 _DATA_SETS = 64
 _FROM_PRIOR = 3072  # draws of the prior that all data sets share
 _AROUND = 512  # draws of Student's t for each data set
@@ -49,7 +94,50 @@ _ROUNDS = 2  # fits of Student's t to the draws before
 _BATCH = 128
 _EFFECTIVE = 30.0  # effective draws; below, the covariance of the linear map and a normal prior
 _DOF = 5.0
+_SIZES = 32  # values of an inferred size, equally probable
 _WIDER = 1.3  # factor by which Student's t is wider than the estimated covariance
+
+
+At = Callable[[jax.Array, ModelError | None, jax.Array], jax.Array]
+"""The function of x (q,), the shared errors (or ``None``) and their unknowns (m,) that returns the
+information F (q, q)."""
+
+
+def information_at(
+    model: Model, observe: Observations, noise: Mapping[str, Noise], *, log: bool
+) -> At:
+    """Return F of data ``observe`` with ``noise`` of known sd, as a function of x.
+
+    Both may be other than the model's: a measurement to add, in all of its load states or some.
+
+    Raises
+    ------
+    InputError
+        A load state that the model does not have.
+    """
+    names, known = model.states.unknowns, model.states.states
+    for state in observe.states:
+        if state not in known:
+            problem = f"load state '{state}' is unknown" if state else "no load state is named"
+            raise InputError(f"{problem}; known: {', '.join(filter(None, known)) or 'none'}")
+    rows = np.array([known.index(state) for state in observe.states])
+    forward = model.full.at(observe.nodes)
+
+    def data(x: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+        thetas = model.states.thetas(dict(zip(names, jnp.exp(x) if log else x, strict=True)))[rows]
+        u = jnp.stack([forward.evaluate(theta).displacement for theta in thetas])
+        means = observe(u, thetas)
+        return ravel_pytree(means)[0], means
+
+    def at(x: jax.Array, error: ModelError | None, sizes: jax.Array) -> jax.Array:
+        J, means = jax.jacfwd(data, has_aux=True)(x)
+        about_means = information_about_means(noise, means)
+        if error is not None:
+            unknowns = jnp.concatenate([jnp.exp(x) if log else x, sizes])
+            about_means = error.information_left(about_means, unknowns, means)
+        return J.T @ about_means @ J
+
+    return at
 
 
 def expected_precision(
@@ -95,49 +183,18 @@ def expected_precision(
     if at is None:
         covariances = _posterior_covariances(model, errors, prior, before, data_sets, seed, log=log)
     else:
-        information = _informations(model, errors, np.array([at[name] for name in names]), log=log)
-        covariances = np.linalg.inv(information + np.linalg.inv(before))
+        means, valid = model.predict({name: jnp.asarray(float(at[name])) for name in names})
+        _some(valid)
+        error = errors(means)
+        information_of = information_at(model, model.observe, model.noise, log=log)
+        x = jnp.asarray([np.log(at[name]) if log else at[name] for name in names])
+        by_size = jax.jit(jax.vmap(lambda sizes: information_of(x, error, sizes)))(sizes_of(error))
+        covariances = np.linalg.inv(np.asarray(by_size) + np.linalg.inv(before))
     sd = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)).mean(axis=0)
     ratio = sd / np.sqrt(np.diagonal(before))
     many = sum(int(np.prod(part.shape)) for part in model.observe.parts.values())
     best = combinations(names, covariances.mean(axis=0), before)[:many] if log else []
     return {"sd": dict(zip(names, ratio.tolist(), strict=True)), "combinations": best}
-
-
-class _Around(NamedTuple):
-    """Student's t: its centre (q,) and the Cholesky factor (q, q) of its scale matrix."""
-
-    centre: jax.Array
-    root: jax.Array
-
-    def draw(self, key: jax.Array, count: int) -> jax.Array:
-        """Return draws (count, q)."""
-        normal, chi2 = jax.random.split(key)
-        q = len(self.centre)
-        z = jax.random.normal(normal, (count, q))
-        g = jax.random.chisquare(chi2, _DOF, (count, 1)) / _DOF
-        return self.centre + (z / jnp.sqrt(g)) @ self.root.T
-
-    def log_density(self, x: jax.Array) -> jax.Array:
-        """Return the log density (s,) of the points x (s, q)."""
-        q = len(self.centre)
-        z = solve_triangular(self.root, (x - self.centre).T, lower=True)
-        constant = (
-            gammaln(0.5 * (_DOF + q)) - gammaln(0.5 * _DOF) - 0.5 * q * jnp.log(_DOF * jnp.pi)
-        )
-        logs = jnp.sum(jnp.log(jnp.diagonal(self.root)))
-        return constant - logs - 0.5 * (_DOF + q) * jnp.log1p(jnp.sum(z**2, axis=0) / _DOF)
-
-
-def _informations(model: Model, errors: Errors, theta: np.ndarray, *, log: bool) -> np.ndarray:
-    """Return F (k, q, q) at ``theta`` (q,), for each size that errors of unknown size may have."""
-    means, valid = model.predict(dict(zip(model.states.unknowns, theta, strict=True)))
-    _some(valid)
-    error = errors(means)
-    information = information_at(model, model.observe, model.noise, log=log)
-    x = jnp.asarray(np.log(theta) if log else theta)
-    matrices, _ = jax.jit(jax.vmap(lambda sizes: information(x, error, sizes)))(sizes_of(error))
-    return np.asarray(matrices)
 
 
 def _posterior_covariances(
@@ -166,12 +223,7 @@ def _posterior_covariances(
     def predicted(x: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
         return model.predict(values(x))
 
-    def log_likelihood(
-        x: jax.Array,
-        answer: tuple[dict[str, jax.Array], jax.Array],
-        data: dict[str, jax.Array],
-        error: ModelError | None,
-    ) -> jax.Array:
+    def log_likelihood(x: jax.Array, answer: Any, data: Any, error: ModelError | None) -> jax.Array:
         means, valid = answer
         log_density = model.log_density({}, means, data)
         if error is not None:
@@ -187,54 +239,47 @@ def _posterior_covariances(
     p_shared = jax.vmap(log_prior)(shared)
     share = len(shared) / (len(shared) + _AROUND)
 
-    def first(
-        x: jax.Array, sizes: jax.Array, data: dict[str, jax.Array], error: ModelError | None
-    ) -> _Around:
-        """Return a Newton step from the data's own x, in the linear map with a normal prior."""
-        Q = _inverse(information(x, error, sizes)[0] + precision)
-        score = jax.grad(lambda x: log_likelihood(x, predicted(x), data, error))(x)
-        score -= precision @ (x - shared.mean(axis=0))
-        step = jnp.where(jnp.isfinite(score), score, 0.0)
-        return _Around(x + Q @ step, _WIDER * jnp.linalg.cholesky(Q))
+    def around(centre: jax.Array, covariance: jax.Array) -> dist.MultivariateStudentT:
+        root = jnp.linalg.cholesky(covariance)
+        return dist.MultivariateStudentT(_DOF, centre, _WIDER * root)
 
-    def covariance(
-        x: jax.Array,
-        sizes: jax.Array,
-        keys: jax.Array,
-        means: dict[str, jax.Array],
-        error: ModelError | None,
-    ) -> jax.Array:
+    def covariance(data_set: tuple[Any, ...]) -> jax.Array:
+        x, sizes, keys, means, error = data_set
         noise_key, *round_keys, error_key = keys
         if error is not None:
             means = error.draw(error_key, jnp.concatenate([thetas(x), sizes]), means)
         parts = model.distributions({}, means)
         each = jax.random.split(noise_key, len(parts))
         data = {n: d.sample(k) for (n, d), k in zip(parts.items(), each, strict=True)}
-        likely_shared = jax.vmap(log_likelihood, in_axes=(0, 0, None, None))(
-            shared, ahead, data, error
-        )
-        around = start = first(x, sizes, data, error)
-        C = normal = start.root @ start.root.T / _WIDER**2
+
+        def likelihood(x: jax.Array) -> jax.Array:
+            return log_likelihood(x, predicted(x), data, error)
+
+        by_shared = jax.vmap(log_likelihood, in_axes=(0, 0, None, None))
+        likely_shared = by_shared(shared, ahead, data, error)
+        # A Newton step from the data's own x, in the linear map with a normal prior.
+        root = jnp.linalg.cholesky(information(x, error, sizes) + precision)
+        half = solve_triangular(root, jnp.eye(len(x)), lower=True)
+        C = normal = half.T @ half
+        score = jax.grad(likelihood)(x) - precision @ (x - shared.mean(axis=0))
+        proposal = around(x + C @ jnp.where(jnp.isfinite(score), score, 0.0), C)
         for k in round_keys:
-            proposals = around.draw(k, _AROUND)
+            proposals = proposal.sample(k, (_AROUND,))
             inside = jax.vmap(log_prior)(proposals)
             # The map may be undefined at points of prior density 0, so it is evaluated at x there.
             evaluated = jnp.where(jnp.isfinite(inside)[:, None], proposals, x)
-            likely = jax.lax.map(
-                lambda x: log_likelihood(x, predicted(x), data, error), evaluated, batch_size=_BATCH
-            )
+            likely = jax.lax.map(likelihood, evaluated, batch_size=_BATCH)
             points = jnp.concatenate([shared, proposals])
             p = jnp.concatenate([p_shared, inside])
-            mixture = jnp.logaddexp(
-                jnp.log(share) + p, jnp.log1p(-share) + around.log_density(points)
-            )
+            drawn = jnp.log1p(-share) + proposal.log_prob(points)
+            mixture = jnp.logaddexp(jnp.log(share) + p, drawn)
             weights = jax.nn.softmax(p + jnp.concatenate([likely_shared, likely]) - mixture)
             mean = weights @ points
             deviation = points - mean
             # A few draws that carry all weight hardly spread: their covariance would be too small.
             enough = 1.0 / jnp.sum(weights**2) >= _EFFECTIVE
             C = jnp.where(enough, (weights[:, None] * deviation).T @ deviation, normal)
-            around = _Around(mean, _WIDER * jnp.linalg.cholesky(C))
+            proposal = around(mean, C)
         return C
 
     truths = jnp.asarray(np.log(prior[:count]) if log else prior[:count])
@@ -245,7 +290,7 @@ def _posterior_covariances(
     keys = jax.vmap(lambda key: jax.random.split(key, 2 + _ROUNDS))(keys)
     set_errors = of_each(errors, means)
     sets = truths, sizes_of(set_errors, count)[rows], keys, means, set_errors
-    covariances = np.asarray(jax.jit(partial(jax.lax.map, lambda each: covariance(*each)))(sets))
+    covariances = np.asarray(jax.jit(partial(jax.lax.map, covariance))(sets))
     return covariances[_some(np.isfinite(covariances).all(axis=(1, 2)))]
 
 
@@ -256,8 +301,89 @@ def _some(valid: Any) -> np.ndarray:
     return np.flatnonzero(valid)
 
 
-def _inverse(A: jax.Array) -> jax.Array:
-    """Return the inverse of a symmetric positive definite matrix."""
-    root = jnp.linalg.cholesky(A)
-    half = solve_triangular(root, jnp.eye(len(A)), lower=True)
-    return half.T @ half
+Errors = Callable[[Mapping[str, Any]], ModelError | None]
+"""The function of data without noise, by name, that returns the model's errors besides noise."""
+
+
+def of_each(errors: Errors, means: Mapping[str, jax.Array]) -> ModelError | None:
+    """Return the errors of all data sets, stacked along a leading axis; means (r, ...) by name."""
+    arrays = {name: np.asarray(values) for name, values in means.items()}
+    count = len(next(iter(arrays.values())))
+    each = [errors({name: values[k] for name, values in arrays.items()}) for k in range(count)]
+    leaves = zip(*(jax.tree.leaves(error) for error in each), strict=True)
+    return jax.tree.unflatten(jax.tree.structure(each[0]), [_stacked(alike) for alike in leaves])
+
+
+def _stacked(arrays: Sequence[Any]) -> np.ndarray:
+    """Return the arrays stacked, with zeros for missing rows: a mode of zeros changes nothing."""
+    shape = np.max([np.shape(array) for array in arrays], axis=0).astype(int)
+    stack = np.zeros((len(arrays), *shape))
+    for k, array in enumerate(arrays):
+        corner: tuple[int | slice, ...] = (k, *(slice(size) for size in np.shape(array)))
+        stack[corner] = array
+    return stack
+
+
+def sizes_of(error: ModelError | None, count: int = _SIZES) -> jax.Array:
+    """Return equally probable sizes (count, 1) of the error; (count, 0) if its size is known."""
+    priors = [] if error is None else list(error.priors.values())
+    if not priors:
+        return jnp.zeros((count, 0))
+    (prior,) = priors
+    return prior.icdf((jnp.arange(count) + 0.5) / count)[:, None]
+
+
+def log_ratio(error: ModelError, theta: jax.Array, residual: Means, means: Means) -> jax.Array:
+    """Return an error's share () of the log likelihood of ``residual`` at ``theta`` (q,)."""
+    sizes = sizes_of(error) if error.priors else jnp.zeros((1, 0))
+
+    def at(size: jax.Array) -> jax.Array:
+        return error.log_ratio(jnp.concatenate([theta, size]), residual, means)
+
+    each = jax.vmap(at)(sizes)
+    return logsumexp(each) - jnp.log(len(sizes))
+
+
+class Candidate(NamedTuple):
+    """Something that could be measured, and what one would know then.
+
+    bits : expected information gain.
+    sd : per unknown, its expected sd relative to the present one.
+    """
+
+    bits: float
+    sd: dict[str, float]
+
+
+def next_measurement(
+    posterior: Posterior, candidates: Mapping[str, tuple[Observation, Noise]]
+) -> dict[str, Candidate]:
+    """Return the candidates by name, the most informative first.
+
+    Parameters
+    ----------
+    candidates : an observation and its noise, of known sd, by name; in a body with several load
+        states the name says in which, as in ``volume@diastole``.
+    """
+    model, draws = posterior.model, posterior.draws()
+    table = np.stack([draws[name] for name in model.states.unknowns], axis=1)
+    log = bool((table > 0.0).all())
+    x = np.log(table) if log else table
+    covariance = np.atleast_2d(np.cov(x, rowvar=False))
+    root = np.linalg.cholesky(covariance)
+    rows = np.linspace(0, len(x) - 1, min(_DRAWS, len(x))).astype(int)
+    gains_by_name = {}
+    for name, (part, noise) in candidates.items():
+        information_of = jax.jit(
+            information_at(model, Observations({name: part}), {name: noise}, log=log)
+        )
+        gains, ratios = [], []
+        for k in rows:
+            information = np.asarray(information_of(jnp.asarray(x[k]), None, jnp.zeros(0)))
+            precision = np.eye(len(root)) + root.T @ information @ root
+            gains.append(0.5 * np.linalg.slogdet(precision)[1] / np.log(2.0))
+            after = root @ np.linalg.solve(precision, root.T)
+            ratios.append(np.sqrt(np.diagonal(after) / np.diagonal(covariance)))
+        sd = dict(zip(model.states.unknowns, np.mean(ratios, axis=0).tolist(), strict=True))
+        gains_by_name[name] = Candidate(float(np.mean(gains)), sd)
+    return dict(sorted(gains_by_name.items(), key=lambda item: -item[1].bits))

@@ -1,4 +1,4 @@
-r"""What data determined, what it says of the tissue's stress, and what to measure next.
+r"""What data determined, with a prior and by likelihood alone, and what it says of the stress.
 
 **Combinations.** Stiffness and load can rise together and leave the body where it is; a table of
 marginals hides that. In :math:`x = \log\theta`, with covariances :math:`S` of the posterior and
@@ -9,6 +9,16 @@ best first, solve
 
 and :math:`1 - \sqrt\lambda` is how far each has contracted.
 
+**Profiles.** How well one unknown explains the data with all others at their best:
+
+.. math:: L_k(v) = \max_{\theta : \theta_k = v} \log p(y \mid \theta)
+          - \max_\theta \log p(y \mid \theta)
+
+No prior enters but its support, so that a flat profile says: the data alone does not determine
+:math:`\theta_k`, whatever the posterior's sd. The 95 % likelihood interval ends where :math:`L_k`
+falls below -1.92 (half the quantile 3.84 of chi-squared with one degree of freedom; Raue et al.
+2009).
+
 **Stress.** The stress-stretch curve is often well known where the parameters are not. Along an
 isochoric stretch :math:`\lambda` of direction e, transversely :math:`\lambda^{-1/2}`,
 
@@ -18,20 +28,12 @@ isochoric stretch :math:`\lambda` of direction e, transversely :math:`\lambda^{-
 with :math:`\sigma_\perp` the mean of the two transverse Cauchy stresses: J is 1 on the whole path,
 so that :math:`\dot W = \sigma : d` and :math:`d = \frac{\dot\lambda}{\lambda}\,
 \text{diag}(1, -\frac12, -\frac12)`. The pressure that incompressibility leaves free drops out.
-
-**Next measurement.** A candidate :math:`y' = g'(x) + \varepsilon'` with the information F' about x
-(:mod:`~calibrate.analysis.fisher`) would add to the present posterior, of covariance C,
-
-.. math:: \Delta = \tfrac12 \log_2 \det\left(1 + C F'\right) \text{ bits},
-
-where the map is linear over the posterior (Lindley 1956; Chaloner and Verdinelli 1995). The gain is
-averaged over draws of the posterior; no data is simulated and no posterior sampled. A candidate has
-its own noise only: an error that it would share with the present data is not counted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -39,12 +41,12 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import eigh
 
-from calibrate.analysis.fisher import information_at
-from calibrate.measurements import Observation, Observations
-from calibrate.noise import Noise
 from calibrate.posterior import Posterior
+from calibrate.priors import bounds
+from calibrate.samplers import density_of
 from calibrate.statistical_model import Model
 from emulator.core.errors import InputError, look_up
+from emulator.core.minimise import minimise
 from emulator.fem.energy import point_energy
 from emulator.scenes.scene import Scene
 from emulator.scenes.tissue import Tissue
@@ -73,7 +75,7 @@ def identify(posterior: Posterior) -> dict[str, Any]:
     after = np.stack([draws[name] for name in names], axis=1)
     before = prior_table(model)
     log = np.array(model.on_log_scale)
-    x, prior = (_on_scale(thetas, log) for thetas in (after, before))
+    x, prior = (np.where(log, np.log(np.where(log, t, 1.0)), t) for t in (after, before))
     contraction = 1.0 - x.std(axis=0, ddof=1) / prior.std(axis=0, ddof=1)
     correlation = np.atleast_2d(np.corrcoef(x, rowvar=False))
     positive = bool((after > 0.0).all() and (before > 0.0).all())
@@ -94,10 +96,6 @@ def prior_table(model: Model) -> np.ndarray:
     """Return draws (s, q) of the unknowns of theta from their prior."""
     draws = model.prior_draws(jax.random.key(0), _PRIOR_DRAWS)
     return np.stack([np.asarray(draws[name]) for name in model.states.unknowns], axis=1)
-
-
-def _on_scale(thetas: np.ndarray, log: np.ndarray) -> np.ndarray:
-    return np.where(log, np.log(np.where(log, thetas, 1.0)), thetas)
 
 
 def combinations(
@@ -166,59 +164,87 @@ def _product(exponents: dict[str, float]) -> str:
     return f"{above or 1} / {f'({below})' if ' ' in below else below}"
 
 
-_DRAWS = 32
+DROP_95 = 1.92
+_BOUND = 12.0  # bound of an unconstrained coordinate, within 1e-5 of its interval's ends
+_WIDTH = 4.0  # posterior sd that the grid covers on each side of the median
 
 
-class Candidate(NamedTuple):
-    """Something that could be measured, and what one would know then.
+class Profile(NamedTuple):
+    """The profile of one unknown.
 
-    bits : expected information gain.
-    sd : per unknown, its expected sd relative to the present one.
+    values : (v,), ascending. drop : (v,) log likelihood below its maximum, 0 at the best.
+    low, high : ends of the 95 % likelihood interval; infinite where the likelihood does not fall so
+        far within ``values``.
     """
 
-    bits: float
-    sd: dict[str, float]
+    values: np.ndarray
+    drop: np.ndarray
+    low: float
+    high: float
 
 
-def next_measurement(
-    posterior: Posterior, candidates: Mapping[str, tuple[Observation, Noise]]
-) -> dict[str, Candidate]:
-    """Return the candidates by name, the most informative first.
+def profile_likelihood(posterior: Posterior, name: str, points: int = 21) -> Profile:
+    """Return the profile of the unknown ``name``, to four posterior sd on each side.
 
-    Parameters
-    ----------
-    candidates : an observation and its noise, of known sd, by name; in a body with several load
-        states the name says in which, as in ``volume@diastole``.
+    Each maximisation starts from the draw nearest in that unknown, and from the best of the point
+    before.
+
+    Raises
+    ------
+    InputError
+        No such unknown.
     """
-    model, draws = posterior.model, posterior.draws()
-    table = np.stack([draws[name] for name in model.states.unknowns], axis=1)
-    log = bool((table > 0.0).all())
-    x = np.log(table) if log else table
-    covariance = np.atleast_2d(np.cov(x, rowvar=False))
-    rows = np.linspace(0, len(x) - 1, min(_DRAWS, len(x))).astype(int)
-    gains_by_name = {}
-    for name, (part, noise) in candidates.items():
-        information_of = jax.jit(
-            information_at(model, Observations({name: part}), {name: noise}, log=log)
-        )
-        gains, ratios = [], []
-        for k in rows:
-            information, _ = information_of(jnp.asarray(x[k]), None, jnp.zeros(0))
-            gain, ratio = _gain(covariance, np.asarray(information))
-            gains.append(gain)
-            ratios.append(ratio)
-        sd = dict(zip(model.states.unknowns, np.mean(ratios, axis=0).tolist(), strict=True))
-        gains_by_name[name] = Candidate(float(np.mean(gains)), sd)
-    return dict(sorted(gains_by_name.items(), key=lambda item: -item[1].bits))
+    model = posterior.model
+    if name not in model.names:
+        raise InputError(f"profile: '{name}' is not inferred; inferred: {', '.join(model.names)}")
+    density, data = density_of(model), posterior.data
+    named = {n: jnp.asarray(values) for n, values in posterior.draws().items()}
+    z = np.asarray(jax.jit(jax.vmap(density.unconstrain))(named))
+    k = density.names.index(name)
+    priors = {**model.prior, **model.noise_priors}
+    limits = [_BOUND if np.isfinite(bounds(priors[n])).all() else np.inf for n in density.names]
+    grid = np.median(z[:, k]) + z[:, k].std() * np.linspace(-_WIDTH, _WIDTH, points)
+    grid = np.clip(grid, -limits[k], limits[k])
+    along = np.median(z, axis=0) + np.zeros((points, 1))
+    along[:, k] = grid
+    values = np.asarray(density.constrain(jnp.asarray(along))[name])
+
+    nuisance = np.array([j for j in range(z.shape[1]) if j != k])
+    bound = np.array(limits)[nuisance]
+
+    @jax.jit
+    @jax.value_and_grad
+    def objective(rest: jax.Array, value: jax.Array) -> jax.Array:
+        point = jnp.zeros(z.shape[1]).at[k].set(value).at[nuisance].set(rest)
+        return -density.log_likelihood(point, data)
+
+    best: list[float] = []
+    last: list[np.ndarray] = []  # where the maximum was at the value before
+    for value in grid:
+        nearest = z[int(np.argmin(np.abs(z[:, k] - value))), nuisance]
+        optima = [
+            minimise(
+                partial(objective, value=value), np.clip(s, -bound, bound), low=-bound, high=bound
+            )
+            for s in (nearest, *last)
+        ]
+        lowest = min(optima, key=lambda minimum: minimum.value)
+        best.append(-lowest.value)
+        last = [lowest.x]
+    drop = np.max(best) - np.array(best)
+    least = int(np.argmin(drop))
+    low = _crossing(values[least::-1], drop[least::-1], -np.inf)
+    return Profile(values, drop, low, _crossing(values[least:], drop[least:], np.inf))
 
 
-def _gain(C: np.ndarray, information: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the gain in bits, and the sd afterwards relative to now (q,)."""
-    root = np.linalg.cholesky(C)
-    precision = np.eye(len(C)) + root.T @ information @ root
-    after = root @ np.linalg.solve(precision, root.T)
-    bits = 0.5 * np.linalg.slogdet(precision)[1] / np.log(2.0)
-    return float(bits), np.sqrt(np.diagonal(after) / np.diagonal(C))
+def _crossing(values: np.ndarray, drop: np.ndarray, otherwise: float) -> float:
+    """Return where the drop first crosses :data:`DROP_95`."""
+    beyond = np.flatnonzero(drop > DROP_95)
+    if not beyond.size:
+        return otherwise
+    i = int(beyond[0])
+    share = (DROP_95 - drop[i - 1]) / (drop[i] - drop[i - 1])
+    return float(values[i - 1] + share * (values[i] - values[i - 1]))
 
 
 STRETCHES = np.linspace(1.0, 1.25, 26)

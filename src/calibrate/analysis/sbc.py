@@ -235,21 +235,14 @@ def sbc(
         rows = np.linspace(0, len(every[model.names[0]]) - 1, draws).astype(int)
         return {name: values[rows] for name, values in every.items()}
 
-    data_sets = _data_sets(truth, replicates, seed, scheduler)
-    return calibration_of(
-        _replicates(model, data_sets, draw or sampled, seed, progress=progress), seed
-    )
-
-
-def _data_sets(truth: Model, count: int, seed: int, scheduler: str | None) -> predictions.Prior:
-    """Return draws of the prior of ``truth``, and data made there."""
-    rng_key = jax.random.key(seed)
-    if scheduler is None:
-        return predictions.prior_replicates(truth, rng_key, count)
-    solved_by(truth.forward, in_process)  # a map that solves nothing is refused before connecting
+    if scheduler is not None:
+        solved_by(truth.forward, in_process)  # a map that solves nothing is refused at once
     with executor(scheduler) as execute:
-        on_workers = replace(truth, forward=solved_by(truth.forward, execute))
-        return predictions.prior_replicates(on_workers, rng_key, count)
+        if scheduler is not None:
+            truth = replace(truth, forward=solved_by(truth.forward, execute))
+        data_sets = predictions.prior_replicates(truth, jax.random.key(seed), replicates)
+    each = _replicates(model, data_sets, draw or sampled, seed, progress=progress)
+    return calibration_of(each, seed)
 
 
 def _replicates(

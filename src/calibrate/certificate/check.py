@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -32,14 +32,14 @@ from threadpoolctl import threadpool_limits
 from calibrate.certificate.estimates import Tests, evidence_of
 from calibrate.certificate.mesh import MOST_RUNS, mesh_change
 from calibrate.certificate.pool import MOST_TEMPERED, Kernels, Pool, key_from, tempered
-from calibrate.certificate.predictive import Correction, Predictive
-from calibrate.certificate.runs import Exploration, Runs, Solver, correction_from, descend
+from calibrate.certificate.predictive import Predictive
+from calibrate.certificate.runs import Runs, Solver, correction_from, descend
 from calibrate.certificate.verdict import Certificate, judge
 from calibrate.posterior import Posterior
 from calibrate.posterior.tree import make_tree
+from calibrate.samplers import SAMPLERS
 from calibrate.samplers.diagnostics import effective, normalised
 from calibrate.samplers.laplace import MISSED_AT, MISSED_BY
-from calibrate.samplers.registry import SAMPLERS
 from calibrate.statistical_model import FEMLikelihood
 from emulator.core.errors import InputError
 from emulator.core.progress import counting
@@ -76,16 +76,6 @@ class Check:
         """Cheap points; ``pool.corrected`` are their weights under the corrected map."""
         return self.tests.pool
 
-    @property
-    def predictive(self) -> Predictive:
-        """Prior, likelihoods and predictions of the posterior's model."""
-        return self.pool.predictive
-
-    @property
-    def correction(self) -> Correction:
-        """The correction that is added to the map."""
-        return self.pool.correction
-
 
 def examine(
     posterior: Posterior,
@@ -113,7 +103,11 @@ def examine(
         The simulator is for another scene, the number of runs is too small, or ``at_most`` is below
         it, the sampler has solved FEM at the draws already, or the scheduler does not answer.
     """
-    _refuse_fem_draws(posterior)
+    sampler = posterior.tree.attrs.get("sampler")
+    if sampler in SAMPLERS and SAMPLERS[sampler].solves_fem:
+        raise InputError(
+            f"the posterior of sampler '{sampler}' is FEM's already; it needs no certificate"
+        )
     count, most = _checked_counts(draws, at_most, mesh)
     predictive = Predictive(posterior.model, posterior.data)
     rng = np.random.default_rng(seed)
@@ -125,15 +119,24 @@ def examine(
         counting(total=count, desc="FEM check", disable=not progress, unit="run") as bar,
     ):
         solver = Solver(predictive, FEMLikelihood(posterior.model, simulator, execute), bar)
-        at_draws, first = _first_runs(solver, z, count, rng)
-        training, total = first.runs, count
+        rows = np.linspace(0, len(z) - 1, max(round(_AT_DRAWS * count), 5)).astype(int)
+        at_draws = solver(z[rows], stability=_STABILITY)
+        # Next to the draws the map may hide a part of the posterior, by an error that draws of the
+        # prior are too far apart to show.
+        surroundings = Kernels.surrounding(z, rng).sample(rng, max(round(_AROUND * count), 4))
+        around = solver(surroundings)
+        prior = predictive.prior_draws(key_from(rng), max(round(_AT_PRIOR * count), 4))
+        at_prior = solver(prior, slopes=True)
+        # Where the map hides a mode altogether, only FEM leads to it.
+        descending = max(round(_DESCENTS * count), min(_FEWEST_DESCENTS, count // 6))
+        descents, modes = descend(solver, at_prior, at_draws, z, descending, rng)
+        training, total = Runs.joined([at_draws, around, at_prior, descents]), count
         while True:
-            explored = first._replace(runs=training)
-            training, pool = _train(solver, z, explored, count, most, rng)
+            training, pool = _train(solver, z, training, modes, count, most, rng)
             rows, log_drawn = pool.tests(total - len(training.z), rng)
             tests = Tests(pool, solver(pool.z[rows]), rows, log_drawn)
             runs = Runs.joined([training, tests.runs])
-            evidence = evidence_of(posterior, at_draws, training, tests, len(first.modes), rng)
+            evidence = evidence_of(posterior, at_draws, training, tests, len(modes), rng)
             count = _further_runs(total, most)
             if judge(evidence).verdict != "undecided" or not count:
                 break
@@ -145,34 +148,12 @@ def examine(
     return Check(judge(replace(evidence, mesh=change)), posterior, tests)
 
 
-def certify(
-    posterior: Posterior,
-    simulator: Simulator,
-    *,
-    draws: int | None = None,
-    at_most: int | None = None,
-    mesh: int | None = None,
-    seed: int = 0,
-    scheduler: str | None = None,
-    progress: bool = False,
-) -> Certificate:
+def certify(posterior: Posterior, simulator: Simulator, **options: Any) -> Certificate:
     """Return the certificate of :func:`examine`: ``posterior`` against ``draws`` FEM runs (200).
 
-    While they leave the verdict undecided they are doubled, up to ``at_most`` if that is given.
-    ``mesh`` is the number of solves on the next finer mesh, 0 for none. ``scheduler`` is the
-    address of a Dask scheduler whose workers solve, as of :func:`calibrate.campaign`.
+    ``options`` are those of :func:`examine`.
     """
-    check = examine(
-        posterior,
-        simulator,
-        draws=draws,
-        at_most=at_most,
-        mesh=mesh,
-        seed=seed,
-        scheduler=scheduler,
-        progress=progress,
-    )
-    return check.certificate
+    return examine(posterior, simulator, **options).certificate
 
 
 def _checked_counts(draws: int | None, at_most: int | None, mesh: int | None) -> tuple[int, int]:
@@ -188,57 +169,22 @@ def _checked_counts(draws: int | None, at_most: int | None, mesh: int | None) ->
     return count, most
 
 
-def _refuse_fem_draws(posterior: Posterior) -> None:
-    sampler = posterior.tree.attrs.get("sampler")
-    if sampler in SAMPLERS and SAMPLERS[sampler].solves_fem:
-        raise InputError(
-            f"the posterior of sampler '{sampler}' is FEM's already; it needs no certificate"
-        )
-
-
-def _first_runs(
-    solver: Solver, z: np.ndarray, count: int, rng: np.random.Generator
-) -> tuple[Runs, Exploration]:
-    """Return FEM at draws, and all runs that any correction needs with further modes of FEM.
-
-    The numbers of runs are in proportion to ``count``.
-    """
-    predictive = solver.predictive
-    rows = np.linspace(0, len(z) - 1, max(round(_AT_DRAWS * count), 5)).astype(int)
-    at_draws = solver(z[rows], stability=_STABILITY)
-    # Next to the draws the map may hide a part of the posterior, by an error that draws of the
-    # prior are too far apart to show.
-    surroundings = Kernels.surrounding(z, rng).sample(rng, max(round(_AROUND * count), 4))
-    around = solver(surroundings)
-    prior = predictive.prior_draws(key_from(rng), max(round(_AT_PRIOR * count), 4))
-    at_prior = solver(prior, slopes=True)
-    # Where the map hides a mode altogether, only FEM leads to it.
-    most = max(round(_DESCENTS * count), min(_FEWEST_DESCENTS, count // 6))
-    descents = descend(solver, at_prior, at_draws, z, most, rng)
-    runs = Runs.joined([at_draws, around, at_prior, descents.runs])
-    return at_draws, descents._replace(runs=runs)
-
-
 def _train(
     solver: Solver,
     z: np.ndarray,
-    explored: Exploration,
+    runs: Runs,
+    modes: tuple[np.ndarray, ...],
     count: int,
     most: int,
     rng: np.random.Generator,
 ) -> tuple[Runs, Pool]:
     """Return all training runs, and the pool under the correction fitted to them.
 
-    Parameters
-    ----------
-    z : the draws (s, p).
-    explored : the earlier runs, and points around further modes of FEM.
-    count : the number of runs, of which adaptive ones are a share.
-    most : the largest number of runs of the whole check.
+    Of ``count`` runs adaptive ones are a share; the whole check has ``most`` at most.
     """
-    predictive, runs = solver.predictive, explored.runs
+    predictive = solver.predictive
     correction = correction_from(runs, predictive, most)
-    pool = Pool.search(predictive, correction, z, explored.modes, rng)
+    pool = Pool.search(predictive, correction, z, modes, rng)
     for size in _rounds(max(round(_ADAPTIVE * count), 1)):
         chances = tempered(pool.log_explored, MOST_TEMPERED)
         if chances.any():
@@ -253,8 +199,7 @@ def _train(
 def _rounds(count: int) -> list[int]:
     """Return the numbers of adaptive runs of each round, which add up to ``count``."""
     rounds = min(_ROUNDS, count)
-    edges = [round(count * k / rounds) for k in range(rounds + 1)]
-    return [end - start for start, end in pairwise(edges)]
+    return np.diff(np.round(count * np.arange(rounds + 1) / rounds).astype(int)).tolist()
 
 
 def _further_runs(total: int, most: int) -> int:
@@ -269,23 +214,17 @@ def _further_runs(total: int, most: int) -> int:
 
 
 def reweight(
-    posterior: Posterior,
-    simulator: Simulator,
-    *,
-    draws: int | None = None,
-    seed: int = 0,
-    progress: bool = False,
+    posterior: Posterior, simulator: Simulator, *, seed: int = 0, **options: Any
 ) -> Posterior:
-    """Return FEM's posterior in place of ``posterior``, checked with ``draws`` FEM runs.
+    """Return FEM's posterior in place of ``posterior``, checked as by :func:`examine`.
 
     Raises
     ------
     InputError
-        As :func:`calibrate.certify`; or the verdict is neither ``accepted`` nor ``reweight``, so
-        that nothing says the reweighted posterior is FEM's.
+        As :func:`examine`; or the verdict is neither ``accepted`` nor ``reweight``, so that nothing
+        says the reweighted posterior is FEM's.
     """
-    check = examine(posterior, simulator, draws=draws, seed=seed, progress=progress)
-    return reweighted(check, seed=seed)
+    return reweighted(examine(posterior, simulator, seed=seed, **options), seed=seed)
 
 
 def can_reweight(certificate: Certificate) -> bool:
@@ -311,20 +250,17 @@ def reweighted(check: Check, *, seed: int = 0) -> Posterior:
             f"reweight: the verdict is '{verdict}' ({check.certificate.reason}); a reweighted "
             "posterior needs 'reweight' or 'accepted'"
         )
-    pool, predictive, source = check.pool, check.predictive, check.posterior
+    pool, predictive, source = check.pool, check.pool.predictive, check.posterior
     points = effective(pool.corrected)
-    length = int(min(points, 1000.0) // _CHAINS)
-    shape = (_CHAINS, length)
-    rows = pool.resampled(_CHAINS * length, np.random.default_rng([seed, 1]))
+    shape = (_CHAINS, int(min(points, 1000.0) // _CHAINS))
+    rows = pool.resampled(shape[0] * shape[1], np.random.default_rng([seed, 1]))
     by_name = predictive.constrain(pool.z[rows])
     draws = {name: by_name[name].reshape(shape) for name in source.model.names}
     statistics = {"lp": (pool.at.prior + pool.at.corrected)[rows].reshape(shape)}
     flat = jnp.asarray(predictive.corrected_means(pool.z[rows], pool.correction))
-    means = jax.tree.map(
-        np.asarray, jax.vmap(jax.vmap(predictive.by_name))(flat.reshape(*shape, -1))
-    )
-    key = jax.random.key(seed)
-    tree = make_tree(source.model, source.data, draws, statistics, key, means)
+    means = jax.vmap(jax.vmap(predictive.by_name))(flat.reshape(*shape, -1))
+    means = jax.tree.map(np.asarray, means)
+    tree = make_tree(source.model, source.data, draws, statistics, jax.random.key(seed), means)
     attributes = {n: a for n, a in source.tree.attrs.items() if n not in _OF_OTHER_DRAWS}
     tree.attrs.update(attributes)
     tree.attrs["reweighted"] = json.dumps({"verdict": verdict, "effective_points": points})

@@ -147,13 +147,14 @@ def figures_of(
     posterior: Posterior, tests: Tests
 ) -> tuple[Changes, Changes, dict[str, Figure], dict[str, Figure]]:
     """Return FEM's changes of the draws and of the corrected posterior, and its means and sds."""
-    pool, names = tests.pool, posterior.model.names
-    by_name = posterior.draws()
-    draws = np.stack([by_name[name] for name in names], axis=1)
+    pool, names, p = tests.pool, posterior.model.names, len(posterior.model.names)
+    draws = np.stack(list(posterior.draws().values()), axis=1)
     x, corrected = pool.predictive.columns(pool.z), pool.corrected
     by_fem, by_map = normalised(tests.log_fem), normalised(tests.log_corrected)
     # Masses are below quantiles of the draws, and of the corrected posterior.
-    edges = np.hstack([_quantiles(draws, None), _quantiles(x, corrected)])
+    levels = list(LARGEST_MASS)
+    of_map = np.quantile(x, levels, axis=0, weights=corrected, method="inverted_cdf")
+    edges = np.vstack([np.quantile(draws, levels, axis=0), of_map]).T
 
     def below(points: np.ndarray) -> np.ndarray:
         return np.repeat(points, edges.shape[1], axis=1) <= edges.ravel()
@@ -173,34 +174,13 @@ def figures_of(
     fem, error = base + step, np.hypot(base_error, step_error)
     # The draws' own mass below their quantiles: a quantile may be a draw that comes often.
     plain = np.concatenate([moments(draws, np.ones(len(draws))), below(draws).mean(axis=0)])
-    of_draws = _changes(names, fem - plain, error, plain, edges=0)
-    of_corrected = _changes(names, step, step_error, base, edges=1)
-    mean, log_sd, _, _ = _parts(fem, len(names))
-    mean_error, log_sd_error, _, _ = _parts(error, len(names))
-    sd = np.exp(log_sd)
+    sd = np.exp(fem[p : 2 * p])
     return (
-        of_draws,
-        of_corrected,
-        _named(names, mean, mean_error),
-        _named(names, sd, sd * log_sd_error),
+        _changes(names, fem - plain, error, plain, edges=0),
+        _changes(names, step, step_error, base, edges=1),
+        dict(zip(names, as_figures(fem, error), strict=False)),
+        dict(zip(names, as_figures(sd, sd * error[p : 2 * p]), strict=True)),
     )
-
-
-def _quantiles(x: np.ndarray, weights: np.ndarray | None) -> np.ndarray:
-    """Return quantiles (p, levels) of points (s, p) at the levels of :data:`LARGEST_MASS`."""
-    levels = np.array(list(LARGEST_MASS))
-    if weights is None:
-        return np.quantile(x, levels, axis=0).T
-    return np.quantile(x, levels, axis=0, weights=weights, method="inverted_cdf").T
-
-
-def _parts(figures: np.ndarray, p: int) -> list[np.ndarray]:
-    """Return means (p,), log sds (p,), correlations, and masses (p, 2, levels) of one vector.
-
-    Masses are below the quantiles of the draws, 0, and of the corrected posterior, 1.
-    """
-    mean, log_sd, correlation, mass = np.split(figures, [p, 2 * p, 2 * p + p * (p - 1) // 2])
-    return [mean, log_sd, correlation, mass.reshape(p, 2, len(LARGEST_MASS))]
 
 
 def _changes(
@@ -210,25 +190,26 @@ def _changes(
 
     edges : masses are below the quantiles of the draws, 0, or of the corrected posterior, 1.
     """
-    p = len(names)
-    mean, log_sd, correlation, mass = _parts(change, p)
-    mean_error, log_sd_error, correlation_error, mass_error = _parts(error, p)
-    sd = np.exp(_parts(before, p)[1])
-    pairs = tuple(f"{a} and {b}" for a, b in combinations(names, 2))
+    p, levels = len(names), len(LARGEST_MASS)
+    pairs = [f"{a} and {b}" for a, b in combinations(names, 2)]
+    unit = np.concatenate([np.exp(before[p : 2 * p]), np.ones(len(change) - p)])
     with np.errstate(divide="ignore", invalid="ignore"):
-        return Changes(
-            _named(names, mean / sd, mean_error / sd),
-            _named(names, log_sd, log_sd_error),
-            _named(pairs, correlation, correlation_error),
-            {
-                level: _named(names, mass[:, edges, k], mass_error[:, edges, k])
-                for k, level in enumerate(LARGEST_MASS)
-            },
-        )
+        figures = as_figures(change / unit, error / unit)
+    masses = figures[2 * p + len(pairs) :]  # of each name below both edges, level by level
+    return Changes(
+        dict(zip(names, figures, strict=False)),
+        dict(zip(names, figures[p:], strict=False)),
+        dict(zip(pairs, figures[2 * p :], strict=False)),
+        {
+            level: dict(zip(names, masses[edges * levels + k :: 2 * levels], strict=True))
+            for k, level in enumerate(LARGEST_MASS)
+        },
+    )
 
 
-def _named(names: tuple[str, ...], values: np.ndarray, errors: np.ndarray) -> dict[str, Figure]:
-    return {n: Figure(float(v), float(e)) for n, v, e in zip(names, values, errors, strict=True)}
+def as_figures(values: np.ndarray, errors: np.ndarray) -> list[Figure]:
+    """Return each value with its error."""
+    return [Figure(float(v), float(e)) for v, e in zip(values, errors, strict=True)]
 
 
 def sampling_of(posterior: Posterior) -> Sampling:

@@ -20,8 +20,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from tqdm import tqdm
 
-from calibrate.certificate.estimates import jackknife, moments
-from calibrate.certificate.pool import ENOUGH, Pool
+from calibrate.certificate.estimates import as_figures, jackknife, moments
+from calibrate.certificate.pool import Pool
 from calibrate.certificate.predictive import (
     Correction,
     Predictive,
@@ -30,10 +30,9 @@ from calibrate.certificate.predictive import (
     no_correction,
 )
 from calibrate.certificate.runs import Runs
-from calibrate.certificate.verdict import Figure, MeshChange
+from calibrate.certificate.verdict import MeshChange
 from calibrate.measurements import Observations
 from calibrate.measurements.outputs import on_finer
-from calibrate.samplers.diagnostics import effective, normalised
 from emulator.accuracy.mesh_error import MeshError, MeshErrorEstimate, mesh_error
 from emulator.core.errors import InputError, SolverError
 from emulator.core.progress import counting
@@ -90,7 +89,7 @@ def mesh_change(
     except InputError as reason:
         return MeshChange(why=str(reason))
     states = len(predictive.model.states.states)
-    points = points_for(predictive.dimension, states, count)
+    points = points_for(pool.z.shape[1], states, count)
     solves = points * states
     with counting(total=solves, desc="finer mesh", disable=not progress, unit="solve") as bar:
         differences = _differences_of_fem(predictive, error, observe, bar)
@@ -150,13 +149,13 @@ def change_by(
     predictive, names = pool.predictive, pool.predictive.model.names
     correction_by = _corrections_by(predictive, runs)
     z, D = _at_draws(differences, pool, -(-count // 2), rng)
-    fine = _followed(pool, correction_by(z, D), rng)
+    fine = pool.corrected_by(correction_by(z, D)).polished(rng, _ROUNDS, cheap=False)
     more_z, more_D = _at_draws(differences, fine, count // 2, rng)
     z, D = np.concatenate([z, more_z]), np.concatenate([D, more_D])
     failed = count - len(z)
     if len(z) < _FEWEST:
         return MeshChange(runs=count, failed=failed)
-    fine = _followed(fine, correction_by(z, D), rng)
+    fine = fine.corrected_by(correction_by(z, D)).polished(rng, _ROUNDS, cheap=False)
     # The corrected posterior on the mesh, over the same points.
     before = fine.corrected_by(correction_by(z[:0], D[:0])).corrected
     x, p = predictive.columns(fine.z), len(names)
@@ -172,7 +171,7 @@ def change_by(
     ]
     variance = np.sum((np.array(leave_one_out) - value) ** 2, axis=0) * (len(z) - 1) / len(z)
     error = np.hypot(error, np.sqrt(variance))
-    figures = [Figure(float(v), float(e)) for v, e in zip(value, error, strict=True)]
+    figures = as_figures(value, error)
     return MeshChange(
         dict(zip(names, figures[:p], strict=True)),
         dict(zip(names, figures[p:], strict=True)),
@@ -216,13 +215,3 @@ def _at_draws(
     converged = np.array([difference is not None for difference in every], dtype=bool)
     D = np.array([difference for difference in every if difference is not None])
     return z[converged], D.reshape(-1, len(pool.predictive.scales))
-
-
-def _followed(pool: Pool, correction: Correction, rng: np.random.Generator) -> Pool:
-    """Return the pool with points in the posterior under ``correction``."""
-    pool = pool.corrected_by(correction)
-    for _ in range(_ROUNDS):
-        if effective(normalised(pool.log_corrected)) >= ENOUGH:
-            break
-        pool = pool.stepped(pool.log_corrected, rng)
-    return pool

@@ -35,7 +35,7 @@ from calibrate.certificate.predictive import Correction, Evaluated, Predictive
 from calibrate.samplers import transport
 from calibrate.samplers.diagnostics import effective, normalised
 
-ENOUGH = 800.0  # effective points at which the pool is good
+_ENOUGH = 800.0  # effective points at which the pool is good
 MOST_TEMPERED = 300.0  # effective points that the kernels of the next step are put on, at most
 _TEMPERED_SHARE = 0.15  # that number at most, as a share of the pool's points
 _FOLLOWING = 2048  # points of the proposal that follows the draws
@@ -256,12 +256,18 @@ class Pool:
         at = (np.arange(count) + rng.uniform()) / count * edges[-1]
         return rng.permutation(np.minimum(np.searchsorted(edges, at), len(edges) - 1))
 
-    def polished(self, rng: np.random.Generator) -> Pool:
-        """Return a pool with :data:`ENOUGH` effective points, under the map and corrected."""
+    def polished(
+        self, rng: np.random.Generator, rounds: int = _POLISH_ROUNDS, *, cheap: bool = True
+    ) -> Pool:
+        """Return a pool with 800 effective points, corrected and, if ``cheap``, by the map alone.
+
+        After ``rounds`` steps they may be fewer.
+        """
         pool = self
-        for _ in range(_POLISH_ROUNDS):
-            poorest = min((pool.log_corrected, pool.log_cheap), key=_effective)
-            if _effective(poorest) >= ENOUGH:
+        for _ in range(rounds):
+            posteriors = [pool.log_corrected, pool.log_cheap] if cheap else [pool.log_corrected]
+            poorest = min(posteriors, key=_effective)
+            if _effective(poorest) >= _ENOUGH:
                 break
             pool = pool.stepped(poorest, rng)
         return pool

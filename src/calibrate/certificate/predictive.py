@@ -29,9 +29,9 @@ spoils everywhere is worse than none.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -157,6 +157,11 @@ class Evaluated(NamedTuple):
     means: Any
 
 
+def _compiled(method: Callable[..., Any]) -> Any:
+    """Return the method as a program that each object compiles once."""
+    return cached_property(lambda self: jax.jit(partial(method, self)))
+
+
 @dataclass(frozen=True, eq=False)
 class Predictive:
     """Prior, likelihoods and predictions of a model given its data, at points z (s, p)."""
@@ -167,11 +172,6 @@ class Predictive:
     @cached_property
     def _density(self) -> Density:
         return density_of(self.model)
-
-    @property
-    def dimension(self) -> int:
-        """Number of unconstrained coordinates."""
-        return self._density.dimension
 
     def constrain(self, z: np.ndarray) -> dict[str, np.ndarray]:
         """Return draws by name, each (s,)."""
@@ -191,40 +191,32 @@ class Predictive:
         """Return points (count, p) drawn from the prior."""
         return _finite_coordinates(self._prior_draws(jax.random.split(rng_key, count)))
 
-    @cached_property
-    def uncorrected(self) -> Correction:
-        """The correction of this model's data that is zero."""
-        return no_correction(1, len(self.model.states.unknowns), len(self.scales))
+    def by_map(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return ``prior``, ``cheap`` and ``means`` of :class:`Evaluated` at points (s, p)."""
+        return self._in_blocks(self._map_block, z)
 
     def evaluate(self, z: np.ndarray, correction: Correction) -> Evaluated:
         """Return log densities at points (s, p)."""
-        prior, cheap, means = self._in_blocks(self._map_block, z)
+        prior, cheap, means = self.by_map(z)
         unknown = np.full(len(z), -np.inf)
         at = Evaluated(prior, cheap, unknown, unknown, means)
         return self.evaluate_again(z, at, correction)
 
     def evaluate_again(self, z: np.ndarray, at: Evaluated, correction: Correction) -> Evaluated:
-        """Return ``at``, which belongs to ``z`` (s, p), under another correction.
-
-        The map is not evaluated again.
-        """
-
-        def block(points: jax.Array, means: jax.Array) -> tuple[jax.Array, jax.Array]:
-            return self._correction_block(points, means, correction)
-
-        corrected, variance = self._in_blocks(block, z, at.means)
+        """Return ``at``, of ``z`` (s, p), under another correction; the map is not asked again."""
+        program = partial(self._correction_block, correction)
+        corrected, variance = self._in_blocks(program, z, at.means)
         return at._replace(corrected=corrected, variance=variance)
 
     def means(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the map's data without noise, flat (s, m), and whether it has an answer (s,)."""
-        means = self._in_blocks(self._map_block, z)[2]
+        means = self.by_map(z)[2]
         valid = np.isfinite(means).all(axis=1)
         return np.where(valid[:, None], means, 0.0), valid
 
     def corrected_means(self, z: np.ndarray, correction: Correction) -> np.ndarray:
         """Return the corrected map's data without noise, flat (s, m)."""
-        features, means = self.features(z), self.means(z)[0]
-        return means + np.asarray(corrections(correction, features))
+        return self.means(z)[0] + np.asarray(corrections(correction, self.features(z)))
 
     def curvature(
         self, z: np.ndarray, means: np.ndarray, slopes: np.ndarray
@@ -252,28 +244,22 @@ class Predictive:
         """Sd (p,) of the prior's z."""
         return self.prior_draws(jax.random.key(1), _WIDTH_DRAWS).std(axis=0)
 
-    @cached_property
-    def _curvature(self) -> Any:
-        def curvature(z: jax.Array, means: jax.Array, slopes: jax.Array) -> tuple[jax.Array, ...]:
-            def likelihood(z: jax.Array, flat: jax.Array) -> jax.Array:
-                draws = self._constrain(z)
-                return self.model.fem_log_likelihood(draws, self.by_name(flat), self.data)
+    @_compiled
+    def _curvature(self, z: jax.Array, means: jax.Array, slopes: jax.Array) -> Any:
+        def likelihood(z: jax.Array, flat: jax.Array) -> jax.Array:
+            draws = self._constrain(z)
+            return self.model.fem_log_likelihood(draws, self.by_name(flat), self.data)
 
-            def thetas(z: jax.Array) -> jax.Array:
-                return self.model.states.thetas(self._constrain(z))
-
-            J = jnp.tensordot(slopes, jax.jacfwd(thetas)(z), axes=2)
-            in_z, in_means = jax.grad(likelihood, argnums=(0, 1))(z, means)
-            second = jax.hessian(likelihood, argnums=1)(z, means)
-            prior, in_prior = jax.value_and_grad(self._density.log_prior)(z)
-            return prior, J.T @ in_means + in_z + in_prior, -J.T @ second @ J
-
-        return jax.jit(curvature)
+        J = jax.jacfwd(lambda z: self.model.states.thetas(self._constrain(z)))(z)
+        J = jnp.tensordot(slopes, J, axes=2)
+        in_z, in_means = jax.grad(likelihood, argnums=(0, 1))(z, means)
+        second = jax.hessian(likelihood, argnums=1)(z, means)
+        prior, in_prior = jax.value_and_grad(self._density.log_prior)(z)
+        return prior, J.T @ in_means + in_z + in_prior, -J.T @ second @ J
 
     def features(self, z: np.ndarray) -> np.ndarray:
         """Return the unknowns (s, q) of theta on their parameters' scales, standardised."""
-        draws = self.constrain(z)
-        return np.asarray(self._compiled_features(draws))
+        return np.asarray(self._features(self.constrain(z)))
 
     @cached_property
     def scales(self) -> np.ndarray:
@@ -287,10 +273,8 @@ class Predictive:
     @cached_property
     def _scale_of_features(self) -> tuple[np.ndarray, np.ndarray]:
         with jax.ensure_compile_time_eval():
-            key = jax.random.key(0)
-            x = np.asarray(
-                jax.jit(lambda key: self._on_scales(self.model.prior_draws(key, _WIDTH_DRAWS)))(key)
-            )
+            draws = jax.jit(lambda key: self._on_scales(self.model.prior_draws(key, _WIDTH_DRAWS)))
+            x = np.asarray(draws(jax.random.key(0)))
         return x.mean(axis=0), x.std(axis=0)
 
     def _on_scales(self, draws: Mapping[str, jax.Array]) -> jax.Array:
@@ -301,60 +285,44 @@ class Predictive:
         ]
         return jnp.stack(columns, axis=-1)
 
+    @_compiled
     def _features(self, draws: Mapping[str, jax.Array]) -> jax.Array:
         centre, width = self._scale_of_features
         return (self._on_scales(draws) - centre) / width
 
-    @cached_property
-    def _compiled_features(self) -> Any:
-        return jax.jit(self._features)
-
     def _constrain(self, z: jax.Array) -> dict[str, jax.Array]:
         return jax.tree.map(lambda values: values[0], self._density.constrain(z[None]))
-
-    def _by_map(self, z: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return log prior, log likelihood, and data without noise, flat (m,), at one point."""
-        draws = self._constrain(z)
-        means, valid = self.model.predict(draws)
-        cheap = self.model.map_log_likelihood(draws, self.data)
-        flat = jnp.where(valid, ravel_pytree(means)[0], jnp.nan)
-        return (
-            _without_nan(self._density.log_prior(z)),
-            _without_nan(jnp.where(valid, cheap, -jnp.inf)),
-            flat,
-        )
-
-    def _by_correction(
-        self, z: jax.Array, flat: jax.Array, correction: Correction
-    ) -> tuple[jax.Array, jax.Array]:
-        """Return the log likelihood of the map's data ``flat`` (m,) corrected, and its variance."""
-        draws = self._constrain(z)
-        step, variance = correct(correction, self._features(draws))
-        means = self.by_name(flat + step)
-        return _without_nan(self.model.fem_log_likelihood(draws, means, self.data)), variance
 
     def by_name(self, flat: jax.Array) -> dict[str, jax.Array]:
         """Return flat data (m,) by the observation's name."""
         parts = self.model.observe.parts
         return ravel_pytree({name: jnp.zeros(parts[name].shape) for name in parts})[1](flat)
 
-    @cached_property
-    def _map_block(self) -> Any:
-        return jax.jit(lambda z: jax.lax.map(self._by_map, z, batch_size=_BATCH))
+    @_compiled
+    def _map_block(self, z: jax.Array) -> Any:
+        def one(z: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+            draws = self._constrain(z)
+            means, valid = self.model.predict(draws)
+            cheap = self.model.map_log_likelihood(draws, self.data)
+            flat = jnp.where(valid, ravel_pytree(means)[0], jnp.nan)
+            cheap = _without_nan(jnp.where(valid, cheap, -jnp.inf))
+            return _without_nan(self._density.log_prior(z)), cheap, flat
 
-    @cached_property
-    def _correction_block(self) -> Any:
-        def block(z: jax.Array, means: jax.Array, correction: Correction) -> Any:
-            def one(x: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-                return self._by_correction(*x, correction)
+        return jax.lax.map(one, z, batch_size=_BATCH)
 
-            return jax.lax.map(one, (z, means), batch_size=_BATCH)
+    @_compiled
+    def _correction_block(self, correction: Correction, z: jax.Array, means: jax.Array) -> Any:
+        def one(point: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            draws = self._constrain(point[0])
+            step, variance = correct(correction, self._features(draws))
+            means = self.by_name(point[1] + step)
+            return _without_nan(self.model.fem_log_likelihood(draws, means, self.data)), variance
 
-        return jax.jit(block)
+        return jax.lax.map(one, (z, means), batch_size=_BATCH)
 
-    @cached_property
-    def _prior_draws(self) -> Any:
-        return jax.jit(jax.vmap(self._density.prior_draw))
+    @_compiled
+    def _prior_draws(self, keys: jax.Array) -> jax.Array:
+        return jax.vmap(self._density.prior_draw)(keys)
 
     def _in_blocks(self, program: Any, *points: np.ndarray) -> Any:
         """Return ``program`` of arrays (s, ...), called with padded blocks of one shape."""

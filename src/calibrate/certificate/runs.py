@@ -69,28 +69,12 @@ class Runs(NamedTuple):
         """Whether FEM converged in each run, (s,)."""
         return np.isfinite(self.means).all(axis=1)
 
-    def likely(self, dimension: int) -> np.ndarray:
-        """Return whether each run (s,) is within reach of the best one's Gaussian."""
-        return self.fem > least_likely(self.fem.max(), dimension, _LIKELY)
-
-    def first(self, count: int) -> Runs:
-        """Return the first ``count`` runs."""
-        z, fem, means, smallest_J, stable, slopes = self
-        cut = slice(count)
-        return Runs(z[cut], fem[cut], means[cut], smallest_J[cut], stable[cut], slopes[cut])
-
     @classmethod
     def joined(cls, parts: Iterable[Runs]) -> Runs:
         """Return the runs of all parts, one part after the other."""
-        z, fem, means, smallest_J, stable, slopes = zip(*parts, strict=True)
-        return cls(
-            np.concatenate(z),
-            np.concatenate(fem),
-            np.concatenate(means),
-            np.concatenate(smallest_J),
-            tuple(chain(*stable)),
-            tuple(chain(*slopes)),
-        )
+        *arrays, stable, slopes = zip(*parts, strict=True)
+        joined = map(np.concatenate, arrays)
+        return cls._make([*joined, tuple(chain(*stable)), tuple(chain(*slopes))])
 
 
 @dataclass
@@ -143,16 +127,9 @@ def correction_from(runs: Runs, predictive: Predictive, rows: int) -> Correction
     usable = valid & runs.converged
     if usable.sum() < x.shape[1] + 2:
         return no_correction(rows, x.shape[1], means.shape[1])
-    likely = runs.likely(predictive.dimension)[usable]
+    likely = runs.fem > least_likely(runs.fem.max(), runs.z.shape[1], _LIKELY)
     errors = (runs.means - means)[usable]
-    return fit_correction(x[usable], errors, predictive.scales, rows, likely)
-
-
-class Exploration(NamedTuple):
-    """FEM runs away from the draws, and points (_, p) around each further mode of FEM."""
-
-    runs: Runs
-    modes: tuple[np.ndarray, ...]
+    return fit_correction(x[usable], errors, predictive.scales, rows, likely[usable])
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,18 +160,6 @@ class _Descent:
         log_posterior = prior + runs.fem[k]
         return cls(z, log_posterior, curvature, z + step, log_posterior + gain)
 
-    def advanced(self, predictive: Predictive, runs: Runs, k: int) -> _Descent:
-        """Return the descent at run ``k`` if FEM's posterior is higher there, else a half step."""
-        trial = _Descent.from_run(predictive, runs, k)
-        if trial is not None and trial.log_posterior > self.log_posterior:
-            return trial
-        return replace(self, target=0.5 * (self.z + self.target))
-
-    def converged(self, predictive: Predictive) -> bool:
-        """Return whether the next step is too short to matter."""
-        length = np.linalg.norm((self.target - self.z) / predictive.prior_sd)
-        return bool(length < _SHORTEST)
-
 
 def descend(
     solver: Solver,
@@ -203,23 +168,38 @@ def descend(
     draws: np.ndarray,
     count: int,
     rng: np.random.Generator,
-) -> Exploration:
+) -> tuple[Runs, tuple[np.ndarray, ...]]:
     """Search modes of FEM's posterior away from the draws, with at most ``count`` FEM runs.
+
+    Return the runs, and points (_, p) around each further mode of FEM.
 
     starts : runs with slopes, at which descents begin.
     at_draws : runs at some of the draws. draws : all draws (s, p).
     """
-    predictive = solver.predictive
-    prior = predictive.evaluate(at_draws.z, predictive.uncorrected).prior
-    best = float(np.max(prior + at_draws.fem))
-    known = _KnownRegion(predictive, draws, best)
+    predictive, sd = solver.predictive, solver.predictive.prior_sd
+    best = float(np.max(predictive.by_map(at_draws.z)[0] + at_draws.fem))
+    least = least_likely(best, draws.shape[1], _LIKELY)
+    values, vectors = eigh(np.atleast_2d(np.cov(draws, rowvar=False)) + 1e-12 * np.eye(len(sd)))
+    far = chdtri(len(sd), 1.0 - _AMONG)
+
+    def away(points: dict[int, np.ndarray]) -> list[int]:
+        """Return the keys of points (p,) not among the draws, or that the map finds unlikely."""
+        if not points:
+            return []
+        z = np.stack(list(points.values()))
+        prior, cheap, _ = predictive.by_map(z)
+        white = (z - draws.mean(axis=0)) @ (vectors / np.sqrt(values))
+        known = ((white**2).sum(axis=1) <= far) & (prior + cheap > least - _MISSED)
+        return [key for key, inside in zip(points, known, strict=True) if not inside]
+
     candidates = (_Descent.from_run(predictive, starts, k) for k in range(len(starts.z)))
     descents = {k: d for k, d in enumerate(candidates) if d is not None}
-    parts: list[Runs] = []
+    parts = [Runs._make(column[:0] for column in starts)]
     remaining, width = count, max(-(-count // ROUNDS), 1)
     while remaining:
         targets = {k: d.target for k, d in descents.items()}
-        active = [k for k in known.outside(targets) if not descents[k].converged(predictive)]
+        lengths = {k: np.linalg.norm((d.target - d.z) / sd) for k, d in descents.items()}
+        active = [k for k in away(targets) if not lengths[k] < _SHORTEST]
         chosen = sorted(active, key=lambda k: -descents[k].promise)[: min(width, remaining)]
         if not chosen:
             break
@@ -227,12 +207,13 @@ def descend(
         parts.append(runs)
         remaining -= len(chosen)
         for row, k in enumerate(chosen):
-            descents[k] = descents[k].advanced(predictive, runs, row)
-    least = least_likely(best, draws.shape[1], _LIKELY)
+            before, trial = descents[k], _Descent.from_run(predictive, runs, row)
+            if trial is None or not trial.log_posterior > before.log_posterior:
+                trial = replace(before, target=0.5 * (before.z + before.target))
+            descents[k] = trial
     points = {k: d.z for k, d in descents.items() if d.log_posterior > least}
-    ends = [descents[k] for k in known.outside(points)]
-    runs = Runs.joined(parts) if parts else starts.first(0)
-    return Exploration(runs, _points_around(ends, predictive.prior_sd, rng))
+    ends = [descents[k] for k in away(points)]
+    return Runs.joined(parts), _points_around(ends, sd, rng)
 
 
 def _points_around(
@@ -251,29 +232,6 @@ def _points_around(
         root = sd[:, None] * vectors / np.sqrt(np.maximum(values, 1.0))
         clouds.append(end.z + rng.normal(size=(_POINTS_OF_END, len(sd))) @ root.T)
     return tuple(clouds)
-
-
-class _KnownRegion:
-    """The Gaussian of the draws (s, p), where it has points that the map finds likely."""
-
-    def __init__(self, predictive: Predictive, draws: np.ndarray, best: float) -> None:
-        self._predictive = predictive
-        self._mean = draws.mean(axis=0)
-        covariance = np.atleast_2d(np.cov(draws, rowvar=False))
-        values, vectors = eigh(covariance + 1e-12 * np.eye(len(covariance)))
-        self._whiten = vectors / np.sqrt(values)
-        self._far = chdtri(len(values), 1.0 - _AMONG)
-        self._least = least_likely(best, len(values), _LIKELY) - _MISSED
-
-    def outside(self, points: dict[int, np.ndarray]) -> list[int]:
-        """Return the keys of the points (p,) that are not in the region."""
-        if not points:
-            return []
-        z = np.stack(list(points.values()))
-        at = self._predictive.evaluate(z, self._predictive.uncorrected)
-        among_draws = (((z - self._mean) @ self._whiten) ** 2).sum(axis=1) <= self._far
-        inside_region = among_draws & (at.prior + at.cheap > self._least)
-        return [key for key, inside in zip(points, inside_region, strict=True) if not inside]
 
 
 def _gauss_newton_step(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
@@ -61,11 +61,10 @@ class Figure:
 
     def within(self, limit: float) -> bool | None:
         """Return whether the size is below ``limit``; ``None`` if the error leaves that open."""
-        if not np.isfinite([self.value, self.error]).all():
+        size, error = abs(self.value), _ERRORS * self.error
+        if not np.isfinite([size, error]).all() or size - error <= limit < size + error:
             return None
-        if abs(self.value) + _ERRORS * self.error <= limit:
-            return True
-        return False if abs(self.value) - _ERRORS * self.error > limit else None
+        return bool(size <= limit)
 
     def factor_to_decide(self, limit: float) -> float:
         """Return the factor in the number of runs that decides, if the value stays as it is.
@@ -98,9 +97,9 @@ class Changes:
     mass : the change of the mass below each quantile, by the quantile's level and by parameter.
     """
 
-    shift: dict[str, Figure]
-    log_sd: dict[str, Figure]
-    correlation: dict[str, Figure]
+    shift: dict[str, Figure] = field(default_factory=dict)
+    log_sd: dict[str, Figure] = field(default_factory=dict)
+    correlation: dict[str, Figure] = field(default_factory=dict)
     mass: dict[float, dict[str, Figure]] = field(default_factory=dict)
 
     def comparisons(self) -> list[Comparison]:
@@ -117,17 +116,11 @@ class Changes:
               for level, figures in self.mass.items() for n, f in figures.items()),
         ]  # fmt: skip
 
-    def within(self) -> bool | None:
-        """Return whether all figures are within their limits; ``None`` if that is undecided."""
-        return _all_within(self.comparisons())
-
 
 @dataclass(frozen=True)
-class MeshChange:
-    """The changes of a posterior by a finer mesh; no figures where nothing is known.
+class MeshChange(Changes):
+    """The changes of means and sds by a finer mesh; no figures where nothing is known.
 
-    shift : the change of each mean, in posterior sd, by parameter.
-    log_sd : the change of the logarithm of each sd, by parameter.
     nodes : the number of nodes of the finer mesh.
     runs, failed : the numbers of solves on the finer mesh, and of those that did not converge.
     linear : whether the coarser mesh has linear elements.
@@ -135,8 +128,6 @@ class MeshChange:
     why : the reason for which no finer mesh was solved; empty if one was.
     """
 
-    shift: dict[str, Figure] = field(default_factory=dict)
-    log_sd: dict[str, Figure] = field(default_factory=dict)
     nodes: int = 0
     runs: int = 0
     failed: int = 0
@@ -153,10 +144,6 @@ class MeshChange:
             *((f"sd of {n} would change by a factor of {np.exp(f.value):.2f}", f,
                LARGEST_MESH_LOG_SD) for n, f in self.log_sd.items()),
         ]  # fmt: skip
-
-    def within(self) -> bool | None:
-        """Return whether all figures are within their limits; ``None`` if that is undecided."""
-        return _all_within(self.comparisons()) if self.shift else None
 
 
 @dataclass(frozen=True)
@@ -217,11 +204,6 @@ class Tail:
     missed: int
     ends: int = 0
 
-    @property
-    def heavy(self) -> bool:
-        """Return whether the tail is too heavy to trust the errors; NaN counts as heavy."""
-        return not (self.k_hat < self.k_threshold or self.largest < NO_TAIL)
-
 
 @dataclass(frozen=True)
 class Evidence:
@@ -245,15 +227,8 @@ class Evidence:
     mesh: MeshChange = MeshChange(why="not asked")
 
 
-class Finding(NamedTuple):
-    """A statement about the posterior, and a remedy where there is one."""
-
-    what: str
-    remedy: str = ""
-
-    def __str__(self) -> str:
-        """Return the statement with its remedy."""
-        return f"{self.what}: {self.remedy}" if self.remedy else self.what
+Finding = tuple[str, str]
+"""A statement about the posterior, and a remedy; empty where there is none."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -320,9 +295,7 @@ class Certificate(TableRepr):
                 "not_asked": e.mesh.why,
             },
             "misfit": {name: asdict(m) for name, m in e.misfit.items()},
-            "sampling": asdict(e.sampling),
-            "physics": asdict(e.physics),
-            "tail": asdict(e.tail),
+            **{name: asdict(getattr(e, name)) for name in ("sampling", "physics", "tail")},
         }
 
 
@@ -344,7 +317,7 @@ def judge(evidence: Evidence) -> Certificate:
 
     Every comparison is written so that NaN fails it.
     """
-    faults = [*_sampling(evidence.sampling), *_physics(evidence.physics), *_misfit(evidence.misfit)]
+    faults = list(_faults(evidence))
     verdict, agreement = _agreement(evidence)
     mesh_is_fine, mesh = _mesh(evidence.mesh)
     if faults or mesh_is_fine is False:
@@ -352,135 +325,126 @@ def judge(evidence: Evidence) -> Certificate:
     elif mesh_is_fine is None and verdict in ("accepted", "reweight"):
         verdict = "undecided"
     if evidence.mesh.why and verdict == "accepted":
-        agreement = [Finding(f"{agreement[0].what} on this mesh")]
+        agreement = [(f"{agreement[0][0]} on this mesh", "")]
     findings = [*faults, *agreement, *mesh] if mesh_is_fine else [*faults, *mesh, *agreement]
-    return Certificate(verdict, findings[0].what, tuple(map(str, findings)), evidence)
+    in_words = tuple(": ".join(filter(None, finding)) for finding in findings)
+    return Certificate(verdict, findings[0][0], in_words, evidence)
 
 
 def _mesh(mesh: MeshChange) -> tuple[bool | None, list[Finding]]:
     """Return whether the posterior stays on a finer mesh, ``None`` if undecided, and findings."""
     if mesh.why:
-        return True, [Finding(f"no finer mesh was asked: {mesh.why}")]
+        return True, [(f"no finer mesh was asked: {mesh.why}", "")]
     finer = f"on a finer mesh ({mesh.nodes} nodes)"
     if not mesh.shift:
         failed = f"FEM failed at {mesh.failed} of {mesh.runs} points {finer}"
-        return None, [Finding(failed, "refine the mesh")]
-    within = mesh.within()
+        return None, [(failed, "refine the mesh")]
+    within = _all_within(comparisons := mesh.comparisons())
     if within:
         worst = max(abs(figure.value) for figure in mesh.shift.values())
         words = f"mesh: {finer} no mean would move by more than {worst:.2f} posterior sd"
-        return True, [Finding(f"{words}, which is widened for it" if mesh.widened else words)]
-    decisive = [w for w, figure, limit in mesh.comparisons() if figure.within(limit) is within]
+        return True, [(f"{words}, which is widened for it" if mesh.widened else words, "")]
+    decisive = [w for w, figure, limit in comparisons if figure.within(limit) is within]
     if within is None:
         close = f"{finer} the {decisive[0]}, too close to the limit for its error"
-        return None, [Finding(close, "give more runs on the finer mesh (--mesh-runs)")]
+        return None, [(close, "give more runs on the finer mesh (--mesh-runs)")]
     remedy = _QUADRATIC if mesh.linear else _REFINE
     if mesh.widened:
         remedy = "learn the error of the mesh from more runs, or emulate the finer mesh"
-    return False, [Finding(f"{finer} the {each}", remedy) for each in decisive]
+    return False, [(f"{finer} the {each}", remedy) for each in decisive]
 
 
 def _agreement(evidence: Evidence) -> tuple[Verdict, list[Finding]]:
     """Return verdict and findings on the draws against FEM."""
     tail, draws = evidence.tail, evidence.draws
-    verdict_of_weights = _weights(tail)
-    if verdict_of_weights is not None:
+    if (verdict_of_weights := _weights(tail)) is not None:
         return verdict_of_weights
-    agree = draws.within()
+    agree = _all_within(comparisons := draws.comparisons())
     if agree:
         worst = max((abs(f.value) for f in draws.shift.values()), default=0.0)
-        return "accepted", [Finding(f"no mean moves by more than {worst:.2f} posterior sd")]
-    decisive = [each for each in draws.comparisons() if each[1].within(each[2]) is agree]
+        return "accepted", [(f"no mean moves by more than {worst:.2f} posterior sd", "")]
+    decisive = [each for each in comparisons if each[1].within(each[2]) is agree]
     if agree is None:
         factor = max(figure.factor_to_decide(limit) for _, figure, limit in decisive)
-        some = f", some {_rounded_up(evidence.physics.runs * factor)}" if factor < _MANY else ""
+        runs = evidence.physics.runs * factor
+        some = f", some {100 * int(np.ceil(runs / 100.0))}" if factor < _MANY else ""
         close = f"{decisive[0][0]}, too close to the limit for its error"
-        return "undecided", [Finding(close, _MORE + some)]
-    repaired = evidence.corrected.within()
+        return "undecided", [(close, _MORE + some)]
+    repaired = _all_within(evidence.corrected.comparisons())
     if repaired:
-        remedy = "use the reweighted posterior"
-        return "reweight", [Finding(words, remedy) for words, _, _ in decisive]
+        return "reweight", [(words, "use the reweighted posterior") for words, _, _ in decisive]
     verdict: Verdict = "undecided" if repaired is None else "not certified"
     remedy = _MORE if repaired is None else "train a better map"
     still = "and reweighting does not repair it"
-    return verdict, [Finding(f"{words}, {still}", remedy) for words, _, _ in decisive]
+    return verdict, [(f"{words}, {still}", remedy) for words, _, _ in decisive]
 
 
 def _weights(tail: Tail) -> tuple[Verdict, list[Finding]] | None:
     """Return verdict and finding where the weights of the FEM runs forbid any other figure."""
     if tail.ess == 0.0:
-        finding = Finding("no FEM run supports the posterior", "check map and FEM options")
-        return "not certified", [finding]
+        return "not certified", [("no FEM run supports the posterior", "check map and FEM options")]
     if tail.spread > LARGEST_SPREAD:
         apart = f"the map differs from FEM irregularly, log ratios spread by {tail.spread:.1f}"
         remedy = "train a better map, or put FEM into the likelihood"
-        return "not certified", [Finding(apart, remedy)]
+        return "not certified", [(apart, remedy)]
     if np.isnan(tail.k_hat):
         few = "too few FEM runs to judge the tail of their weights"
-        return "undecided", [Finding(few, "100 FEM runs or more")]
-    if tail.heavy or not tail.pool >= SMALLEST_POOL:
+        return "undecided", [(few, "100 FEM runs or more")]
+    light = tail.k_hat < tail.k_threshold or tail.largest < NO_TAIL
+    if not (light and tail.pool >= SMALLEST_POOL):
         heavy = "the weights' tail is too heavy to trust their errors"
         if tail.ends:
             places = "one place" if tail.ends == 1 else f"{tail.ends} places"
             away = f"FEM finds the data likely away from the draws, in {places}"
             heavy = f"{away}, and {heavy}"
-        return "undecided", [Finding(heavy, _MORE)]
+        return "undecided", [(heavy, _MORE)]
     if tail.missed:
-        missed = f"{tail.missed} FEM runs are likely where the corrected map says they are not"
-        hidden = f"{missed}, so the map may hide a part of the posterior"
-        return "undecided", [Finding(hidden, f"train a better map, or {_MORE}")]
+        hidden = (
+            f"{tail.missed} FEM runs are likely where the corrected map says they are not, so the "
+            "map may hide a part of the posterior"
+        )
+        return "undecided", [(hidden, f"train a better map, or {_MORE}")]
     return None
 
 
-def _sampling(s: Sampling) -> Iterator[Finding]:
+def _faults(evidence: Evidence) -> Iterator[Finding]:
+    """Yield what is wrong with the draws, FEM at them, and the data, whatever FEM says of them."""
+    s, p = evidence.sampling, evidence.physics
     if not s.vary:
-        yield Finding("the draws of a parameter do not vary", "the sampler is stuck")
+        yield ("the draws of a parameter do not vary", "the sampler is stuck")
     elif not np.isfinite(s.r_hat):
-        yield Finding("R-hat is not a number", "draw more")
+        yield ("R-hat is not a number", "draw more")
     elif not s.r_hat <= REFUSE_ABOVE_R_HAT:
-        disagree = f"the chains disagree, R-hat {s.r_hat:.3f}"
-        yield Finding(disagree, "draw more, or find their modes")
+        yield (f"the chains disagree, R-hat {s.r_hat:.3f}", "draw more, or find their modes")
     if not s.divergences <= max(LARGEST_DIVERGENT * s.transitions, 1):
-        yield Finding(
+        yield (
             f"{s.divergences} of {s.transitions} transitions diverged",
             "the sampler cannot follow the posterior everywhere; raise target_accept, or narrow a "
             "prior the data leaves open",
         )
     if s.vary and not np.min([s.ess_bulk, s.ess_tail]) >= REFUSE_BELOW_ESS:
         few = f"{s.ess_bulk:.0f} in the bulk and {s.ess_tail:.0f} in the tails"
-        remedy = f"draw until both reach {REFUSE_BELOW_ESS:.0f}"
-        yield Finding(f"too few effective draws, {few}", remedy)
-
-
-def _physics(p: Physics) -> Iterator[Finding]:
+        yield (f"too few effective draws, {few}", f"draw until both reach {REFUSE_BELOW_ESS:.0f}")
     if not p.failed_mass <= LARGEST_FAILED:
-        yield Finding(
+        yield (
             f"FEM fails on {100 * p.failed_mass:.0f} % of the posterior",
             "raise --load-steps (NewtonOptions.load_steps), or narrow the prior to states that "
             "exist",
         )
     if p.unstable:
-        yield Finding(
+        yield (
             f"FEM is at a saddle at {p.unstable} of {p.asked} draws",
             "the body would leave that state; follow the loading path with --load-steps 10 "
             "(NewtonOptions.load_steps)",
         )
-
-
-def _misfit(observations: dict[str, Misfit]) -> Iterator[Finding]:
-    for name, m in observations.items():
+    for name, m in evidence.misfit.items():
         if not (m.p >= SMALLEST_P and m.p_worst >= SMALLEST_P_WORST):
             named = ", ".join(f"{k} by {d:.1f} sd" for k, d in list(m.outlying.items())[:4])
             outlying = f"outlying data ({named}), " if named else ""
-            yield Finding(
+            yield (
                 f"{name} does not fit, posterior predictive p {min(m.p, m.p_worst):.3f}",
                 f"check {outlying}registration, units, law and noise sd",
             )
         elif not m.p <= 1.0 - SMALLEST_P:
             close = f"{name} fits closer than its noise allows, posterior predictive p {m.p:.3f}"
-            yield Finding(close, "its noise sd is too large")
-
-
-def _rounded_up(number: float) -> int:
-    """Return the next multiple of 100."""
-    return int(np.ceil(number / 100.0)) * 100
+            yield (close, "its noise sd is too large")

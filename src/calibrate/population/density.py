@@ -8,6 +8,7 @@ independent, with their Jacobian.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -21,7 +22,7 @@ from numpyro.infer.util import potential_energy
 
 from calibrate.population.coordinates import CutNormal, Information, scores_of
 from calibrate.population.model import CHOLESKY, MEDIAN, SCORES, SD, PopulationModel, ends, to_scale
-from calibrate.samplers.density import threads_for
+from calibrate.samplers.density import Target, threads_for
 from calibrate.statistical_model import Data
 
 
@@ -45,23 +46,16 @@ class PopulationDraws(NamedTuple):
     factor: jax.Array
 
 
-class PopulationDensity(NamedTuple):
-    """A log density on real coordinates; see :class:`calibrate.samplers.density.Target`.
+@dataclass(frozen=True)
+class PopulationDensity(Target):
+    """The posterior of a population.
 
     constrain : (z (s, p), information) -> population, scores (s, n, k), own unknowns by site (s,).
     values : (*population (s, ...), scores (s, ..., k)) -> shared unknowns by name (s, ...).
     """
 
-    log_density: Callable[[jax.Array, Conditions], jax.Array]
     constrain: Callable[[jax.Array, Information], tuple[PopulationDraws, jax.Array, dict[str, Any]]]
     values: Callable[..., dict[str, jax.Array]]
-    dimension: int
-    at_once: int
-
-    @property
-    def piloted(self) -> bool:
-        """Always false: a transport map has too many monomials; members are straight already."""
-        return False
 
 
 @lru_cache(maxsize=4)
@@ -106,8 +100,9 @@ def density_of_population(model: PopulationModel) -> PopulationDensity:
 
     return PopulationDensity(
         log_density,
-        jax.jit(jax.vmap(constrain, in_axes=(0, None))),
-        jax.jit(jax.vmap(model.shared_values)),
-        int(np.size(flat)),
-        min(threads_for(member.forward) for member in model.members.values()),
+        dimension=int(np.size(flat)),
+        piloted=False,  # a transport map has too many monomials; members are straight already
+        at_once=min(threads_for(member.forward) for member in model.members.values()),
+        constrain=jax.jit(jax.vmap(constrain, in_axes=(0, None))),
+        values=jax.jit(jax.vmap(model.shared_values)),
     )

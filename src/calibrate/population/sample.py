@@ -121,7 +121,7 @@ def sample_population(
     }
     state = Checkpoint(checkpoint, identity_of(provenance, arrays))
     conditions = Conditions(dict(data), information)
-    draws = NUTS.sample(density, conditions, options, seed, Context(progress, state))
+    draws = NUTS.sample(density, conditions, options, Context(seed, progress, state))
     key = jax.random.fold_in(jax.random.key(seed), _NEW)
     flat = jnp.asarray(draws.z).reshape(-1, density.dimension)
     values = density.constrain(flat, information)

@@ -222,9 +222,9 @@ def sample(
     fem = _fem_likelihood(method, model, simulator)
     record = provenance(model, seed, sampler, options)
     state = Checkpoint(checkpoint, _identity(record, checked))
-    context = Context(progress, state, fem)
+    context = Context(seed, progress, state, fem)
     density = density_of(model)
-    run = method.sample(density, checked, options, seed, context)
+    run = method.sample(density, checked, options, context)
     attributes = dict(run.attributes)
     if MISSED_BY not in attributes:
         z = np.asarray(run.z).reshape(-1, density.dimension)

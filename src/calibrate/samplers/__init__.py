@@ -1,15 +1,23 @@
-"""Samplers behind one protocol: ``protocol`` says what they give, ``registry`` finds them."""
+"""The samplers by name, behind one protocol. A new sampler is one file and one line here."""
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
 
 from calibrate.samplers.chains import ChainSampler
-from calibrate.samplers.delayed_acceptance import DelayedAcceptanceOptions
+from calibrate.samplers.delayed_acceptance import DELAYED_ACCEPTANCE, DelayedAcceptanceOptions
 from calibrate.samplers.density import Density, density_of, named_draws
 from calibrate.samplers.diagnostics import r_hat
-from calibrate.samplers.laplace import LaplaceOptions
-from calibrate.samplers.mclmc import MCLMCOptions
-from calibrate.samplers.nuts import BlackJAXNUTSOptions, NUTSOptions
+from calibrate.samplers.laplace import LAPLACE, LaplaceOptions
+from calibrate.samplers.mclmc import MCLMC, MCLMCOptions
+from calibrate.samplers.nuts import BLACKJAX_NUTS, NUTS, BlackJAXNUTSOptions, NUTSOptions
 from calibrate.samplers.protocol import ChainOptions, Context, Draws, Kernel, Sampler
-from calibrate.samplers.registry import SAMPLERS, check_options, find_sampler, options_from
-from calibrate.samplers.smc import SMCOptions
+from calibrate.samplers.smc import SMC, SMCOptions
+from emulator.core.errors import InputError, look_up
+from emulator.core.schema import Source, parse, table_of
+
+_ALL: tuple[Sampler, ...] = (NUTS, BLACKJAX_NUTS, MCLMC, DELAYED_ACCEPTANCE, SMC, LAPLACE)
+SAMPLERS: dict[str, Sampler] = {sampler.name: sampler for sampler in _ALL}
 
 __all__ = [
     "SAMPLERS",
@@ -33,3 +41,42 @@ __all__ = [
     "options_from",
     "r_hat",
 ]
+
+
+def find_sampler(name: str) -> Sampler:
+    """Return the sampler of that name; :class:`InputError` names the known ones."""
+    return look_up(SAMPLERS, name, "sampler")
+
+
+def check_options(sampler: Sampler, options: Any | None) -> Any:
+    """Return ``options``, or the sampler's defaults for ``None``.
+
+    Raises
+    ------
+    InputError
+        The options are those of another sampler.
+    """
+    if options is None:
+        return sampler.options()
+    if type(options) is not sampler.options:
+        raise InputError(
+            f"sampler '{sampler.name}' takes {sampler.options.__name__}, "
+            f"not {type(options).__name__}"
+        )
+    return options
+
+
+def options_from(sampler: Sampler, values: Mapping[str, Any], **length: int) -> Any:
+    """Return options of a run of this length, with ``values`` by name for the others.
+
+    length : ``warmup``, ``draws`` and ``chains``; what the sampler does not have is left out.
+
+    Raises
+    ------
+    InputError
+        A name that the sampler has no option of, or a value of another type.
+    """
+    source = Source(f"sampler '{sampler.name}'", dict(values), toml=False)
+    parse(table_of(sampler.options), source)
+    known = {field.name for field in fields(sampler.options)}
+    return sampler.options(**{n: k for n, k in length.items() if n in known} | dict(values))

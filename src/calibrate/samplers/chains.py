@@ -26,13 +26,17 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from tqdm import tqdm
 
-from calibrate.samplers import transport
-from calibrate.samplers.checkpoint import Checkpoint
 from calibrate.samplers.density import Target
 from calibrate.samplers.diagnostics import converged
 from calibrate.samplers.protocol import PATHFINDER, ChainOptions, Context, Draws, Kernel, Sampler
+from calibrate.samplers.transport import (
+    StandardMap,
+    apply_standard,
+    coefficient_count,
+    fit_standard,
+    standard_identity,
+)
 from emulator.core.errors import SolverError
 from emulator.core.progress import counting
 
@@ -44,6 +48,9 @@ _PATHS = 4  # Pathfinder's paths of a chain
 _SAMPLES = 20  # samples of a path's Gaussian
 _ITERATIONS = 30
 _MEMORY = 6  # pairs of steps and gradients that make a Gaussian's covariance
+
+States = tuple[Any, ...]
+"""The state of each chain's kernel."""
 
 
 @dataclass(frozen=True)
@@ -58,14 +65,7 @@ class ChainSampler(Sampler):
     kernel: Callable[[Callable[..., jax.Array], Any], Kernel]
     adapts_in_steps: bool = True
 
-    def sample(
-        self,
-        density: Target,
-        data: Any,
-        options: ChainOptions,
-        seed: int,
-        context: Context = Context(),
-    ) -> Draws:
+    def sample(self, density: Target, data: Any, options: ChainOptions, context: Context) -> Draws:
         """Run rounds until the chains agree.
 
         A ridge cut by the prior's box may need several rounds. After the last one the chains may
@@ -76,18 +76,19 @@ class ChainSampler(Sampler):
         SolverError
             No starting point has a finite density.
         """
-        pilot_key, key = jax.random.split(jax.random.key(seed))
-        with counting(desc=self.name, total=0, disable=not context.progress) as bar:
-            chains = Chains(self, density, data, options, context.checkpoint, bar)
-            if not chains.resume():
-                chains.start_straightened(pilot_key, key)
-            elif chains.run == _PILOT:
-                chains.straighten(key)
-            for rounds in range(1, options.rounds + 1):
-                draws = chains.draw(rounds * options.draws)
-                if converged(draws.z, options.r_hat, options.ess):
-                    break
-        return draws
+        chains = Chains(self, density, data, options, context)
+        with chains.bar:
+            chains.begin(jax.random.key(context.seed))
+            return in_rounds(chains.draw, options)
+
+
+def in_rounds(draw: Callable[[int], Draws], options: ChainOptions) -> Draws:
+    """Return ``draw`` of a total number of draws, which rises until the chains agree."""
+    for rounds in range(1, options.rounds + 1):
+        draws = draw(rounds * options.draws)
+        if converged(draws.z, options.r_hat, options.ess):
+            break
+    return draws
 
 
 class Programs:
@@ -105,26 +106,22 @@ class Programs:
         self._start, self._advance, self._at_once = start, advance, at_once
         self._compiled: dict[Any, Callable[..., Any]] = {}
 
-    def start(
-        self, keys: jax.Array, data: Any, map_: transport.StandardMap
-    ) -> tuple[tuple[Any, ...], np.ndarray]:
+    def start(self, keys: jax.Array, data: Any, map_: StandardMap) -> tuple[States, np.ndarray]:
         """Return states of chains, by ``keys`` (c,), and their log densities (c,)."""
         results = self._for_all("start", self._start, tuple(keys), data, map_)
         states, heights = zip(*results, strict=True)
         return states, np.array(heights)
 
     def advance(
-        self, states: tuple[Any, ...], data: Any, map_: transport.StandardMap, count: int
-    ) -> tuple[tuple[Any, ...], Draws]:
+        self, states: States, data: Any, map_: StandardMap, count: int
+    ) -> tuple[States, Draws]:
         """Return all chains' states after ``count`` iterations, and draws (c, count, ...)."""
         advance = partial(self._advance, count=count)
         results = self._for_all(f"advance {count}", advance, states, data, map_)
         states, draws = zip(*results, strict=True)
         return states, jax.tree.map(lambda *chains: np.stack(chains), *draws)
 
-    def shapes(
-        self, chains: int, data: Any, map_: transport.StandardMap
-    ) -> tuple[tuple[Any, ...], Draws]:
+    def shapes(self, chains: int, data: Any, map_: StandardMap) -> tuple[States, Draws]:
         """Return structure, shapes and types of states and draws (c, 1, ...)."""
         state, _ = jax.eval_shape(self._start, jax.random.key(0), data, map_)
         _, draws = jax.eval_shape(partial(self._advance, count=1), state, data, map_)
@@ -132,7 +129,7 @@ class Programs:
         return (state,) * chains, every
 
     def _for_all(
-        self, name: str, function: Callable[..., Any], chains: tuple[Any, ...], *arrays: Any
+        self, name: str, function: Callable[..., Any], chains: States, *arrays: Any
     ) -> list[Any]:
         """Return ``function`` of each chain and the arrays, compiled before threads call it."""
         key = name, *map(jax.typeof, jax.tree.leaves((chains[0], *arrays)))
@@ -152,12 +149,12 @@ class Programs:
 def compile_chains(sampler: ChainSampler, density: Target, options: ChainOptions) -> Programs:
     """Return the programs of a density in straightened coordinates; data and map are arguments."""
 
-    def log_density(w: jax.Array, data: Any, map_: transport.StandardMap) -> jax.Array:
-        return density.log_density(transport.apply_standard(map_, w), data)
+    def log_density(w: jax.Array, data: Any, map_: StandardMap) -> jax.Array:
+        return density.log_density(apply_standard(map_, w), data)
 
     kernel = sampler.kernel(log_density, options)
 
-    def start(key: jax.Array, data: Any, map_: transport.StandardMap) -> Any:
+    def start(key: jax.Array, data: Any, map_: StandardMap) -> Any:
         candidates_key, kernel_key = jax.random.split(key)
         shape = (_CANDIDATES, density.dimension)
         candidates = jax.random.uniform(candidates_key, shape, float, -2.0, 2.0)
@@ -173,10 +170,10 @@ def compile_chains(sampler: ChainSampler, density: Target, options: ChainOptions
         first = jnp.argmax(jnp.isfinite(heights))
         return kernel.init(kernel_key, candidates[first], data, map_), heights[first]
 
-    def advance(state: Any, data: Any, map_: transport.StandardMap, count: int) -> Any:
+    def advance(state: Any, data: Any, map_: StandardMap, count: int) -> Any:
         def step(state: Any, _: None) -> Any:
             state, w, statistics = kernel.step(state, data, map_)
-            return state, Draws(transport.apply_standard(map_, w), statistics)
+            return state, Draws(apply_standard(map_, w), statistics)
 
         return jax.lax.scan(step, state, length=count)
 
@@ -220,8 +217,8 @@ class _State(NamedTuple):
 
     run: Any  # _PILOT or _FINAL
     warmed: Any  # finished iterations of the warm-up
-    map_: transport.StandardMap
-    states: tuple[Any, ...]
+    map_: StandardMap
+    states: States
     draws: Draws
 
 
@@ -234,45 +231,46 @@ class Chains:
         density: Target,
         data: Any,
         options: ChainOptions,
-        checkpoint: Checkpoint,
-        bar: tqdm,
+        context: Context,
     ) -> None:
         self.density, self.data, self.options = density, data, options
-        self.checkpoint, self.bar = checkpoint, bar
+        self.checkpoint = context.checkpoint
+        self.bar = counting(desc=sampler.name, total=0, disable=not context.progress)
         self.programs = compile_chains(sampler, density, options)
         self._warmup = options.warmup if sampler.adapts_in_steps else 0
-        self._parts: list[Draws] = []
-        wanted = max(_PILOT_DRAWS, 10 * transport.coefficient_count(density.dimension))
+        wanted = max(_PILOT_DRAWS, 10 * coefficient_count(density.dimension))
         # In whole chunks: a part of one would be compiled on its own.
         self._pilot = min(options.draws, -(-wanted // (options.chains * _CHUNK)) * _CHUNK)
+        self.map_ = standard_identity(density.dimension, bends=density.piloted)
+        self.states: States = ()
+        self._parts: list[Draws] = []
+        self.run = self.warmed = self._count = 0
 
-    def start_straightened(self, pilot_key: jax.Array, key: jax.Array) -> None:
-        """Run the pilot, if the density wants one, and start the final run."""
-        if self.density.piloted:
-            self._start(_PILOT, self._identity(), pilot_key)
-            self.straighten(key)
-        else:
-            self._start(_FINAL, self._identity(), key)
-
-    def straighten(self, key: jax.Array) -> None:
-        """Complete the pilot run, and start the final one on the map fitted to it."""
-        z = self.draw(self._pilot).z
-        self._start(_FINAL, transport.fit_standard(z.reshape(-1, self.density.dimension)), key)
+    def begin(self, rng_key: jax.Array) -> None:
+        """Run the pilot, if the density wants one, and start the final run, or resume either."""
+        pilot_key, key = jax.random.split(rng_key)
+        if not self._resume():
+            self._start(*((_PILOT, pilot_key) if self.density.piloted else (_FINAL, key)))
+        if self.run == _PILOT:
+            z = self.draw(self._pilot).z
+            self.map_ = fit_standard(z.reshape(-1, self.density.dimension))
+            self._start(_FINAL, key)
 
     def draw(self, total: int) -> Draws:
         """Return the first ``total`` draws of this run, after its warm-up."""
-        while self.warmed < self._warmup:
-            self.warmed += self._advance(self._warmup - self.warmed)[1]
-            self.checkpoint.keep(self._state)
-        while self._count < total:
-            draws, count = self._advance(total - self._count)
-            self._parts.append(draws)
-            self._count += count
+        while (warming := self.warmed < self._warmup) or self._count < total:
+            count = min(_CHUNK, self._warmup - self.warmed if warming else total - self._count)
+            self.states, draws = self.programs.advance(self.states, self.data, self.map_, count)
+            if warming:
+                self.warmed += count
+            else:
+                self._parts.append(draws)
+                self._count += count
+            self._show(count)
             self.checkpoint.keep(self._state)
         return jax.tree.map(lambda array: array[:, :total], join(self._parts))
 
-    def resume(self) -> bool:
-        """Continue from the checkpoint; return ``False`` where there is none."""
+    def _resume(self) -> bool:
         state = self.checkpoint.restore(self._template)
         if state is None:
             return False
@@ -284,19 +282,12 @@ class Chains:
         self._show(self.warmed + self._count)
         return True
 
-    def _start(self, run: int, map_: transport.StandardMap, key: jax.Array) -> None:
+    def _start(self, run: int, key: jax.Array) -> None:
         keys = jax.random.split(key, self.options.chains)
-        self.states, heights = self.programs.start(keys, self.data, map_)
+        self.states, heights = self.programs.start(keys, self.data, self.map_)
         if not np.isfinite(heights).all():
             raise SolverError("the posterior density is zero wherever a chain could start")
-        self.run, self.map_, self.warmed = run, map_, 0
-        self._parts, self._count = [], 0
-
-    def _advance(self, remaining: int) -> tuple[Draws, int]:
-        count = min(_CHUNK, remaining)
-        self.states, draws = self.programs.advance(self.states, self.data, self.map_, count)
-        self._show(count)
-        return draws, count
+        self.run, self.warmed, self._count, self._parts = run, 0, 0, []
 
     def _show(self, count: int) -> None:
         pilot = self._warmup + self._pilot if self.density.piloted else 0
@@ -306,21 +297,16 @@ class Chains:
 
     def _state(self) -> _State:
         # While they warm up, chains have no draws, but names and shapes of draws are known.
-        draws = join(self._parts) if self._parts else jax.tree.map(_empty, self._template().draws)
-        return _State(self.run, self.warmed, self.map_, self.states, draws)
+        def none(draws: jax.ShapeDtypeStruct) -> np.ndarray:
+            return np.zeros((draws.shape[0], 0, *draws.shape[2:]), draws.dtype)
 
-    def _identity(self) -> transport.StandardMap:
-        return transport.standard_identity(self.density.dimension, bends=self.density.piloted)
+        draws = join(self._parts or [jax.tree.map(none, self._template().draws)])
+        return _State(self.run, self.warmed, self.map_, self.states, draws)
 
     def _template(self) -> _State:
         number = jax.ShapeDtypeStruct((), int)
-        map_ = self._identity()
-        states, draws = self.programs.shapes(self.options.chains, self.data, map_)
-        return _State(number, number, map_, states, draws)
-
-
-def _empty(draws: jax.ShapeDtypeStruct) -> np.ndarray:
-    return np.zeros((draws.shape[0], 0, *draws.shape[2:]), draws.dtype)
+        states, draws = self.programs.shapes(self.options.chains, self.data, self.map_)
+        return _State(number, number, self.map_, states, draws)
 
 
 def join(parts: list[Draws]) -> Draws:

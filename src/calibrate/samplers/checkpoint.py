@@ -67,14 +67,20 @@ class Checkpoint:
         named = named_leaves(tree)
         if named.keys() != arrays.keys():
             raise InputError(f"checkpoint {self.path} has other arrays than this run; remove it")
-        leaves = [_to_leaf(arrays[name], leaf.dtype) for name, leaf in named.items()]
+        leaves = [
+            jax.random.wrap_key_data(jnp.asarray(arrays[n])) if _is_key(leaf) else arrays[n]
+            for n, leaf in named.items()
+        ]
         return jax.tree.unflatten(jax.tree.structure(tree), leaves)
 
     def keep(self, state: Callable[[], Any]) -> None:
         """Write ``state()``, if the last write is long enough ago."""
         if self.path is None or time.monotonic() - self._written < self.every:
             return
-        arrays = {name: _to_array(leaf) for name, leaf in named_leaves(state()).items()}
+        arrays = {
+            name: np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
+            for name, leaf in named_leaves(state()).items()
+        }
         save_arrays(self.path, arrays, {"identity": json.dumps(self.identity)})
         self._written = time.monotonic()
 
@@ -107,14 +113,5 @@ def identity_of(
     return {**as_json, "data": digest.hexdigest()[:16]}
 
 
-def _is_key(dtype: Any) -> bool:
-    return jnp.issubdtype(dtype, jax.dtypes.prng_key)
-
-
-def _to_array(leaf: Any) -> np.ndarray:
-    is_key = isinstance(leaf, jax.Array) and _is_key(leaf.dtype)
-    return np.asarray(jax.random.key_data(leaf) if is_key else leaf)
-
-
-def _to_leaf(array: np.ndarray, dtype: Any) -> Any:
-    return jax.random.wrap_key_data(jnp.asarray(array)) if _is_key(dtype) else array
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(getattr(leaf, "dtype", int), jax.dtypes.prng_key)

@@ -31,13 +31,11 @@ import numpy as np
 from tqdm import tqdm
 
 from calibrate.samplers import transport
-from calibrate.samplers.chains import Chains, compile_chains, join
-from calibrate.samplers.checkpoint import Checkpoint
+from calibrate.samplers.chains import Chains, compile_chains, in_rounds, join
 from calibrate.samplers.density import Density, tempered
-from calibrate.samplers.diagnostics import converged
 from calibrate.samplers.nuts import BLACKJAX_NUTS, BlackJAXNUTSOptions
 from calibrate.samplers.protocol import ChainOptions, Context, Draws, Sampler
-from calibrate.statistical_model import Data, FEMLikelihood
+from calibrate.statistical_model import Data
 from emulator.core.errors import InputError, SolverError
 from emulator.core.progress import counting
 
@@ -64,7 +62,6 @@ class DelayedAcceptanceOptions(ChainOptions):
     target_accept: float = 0.85
 
     label: ClassVar[str] = "delayed acceptance"
-    counts: ClassVar[tuple[str, ...]] = (*ChainOptions.counts, "transitions", "discarded")
     shares: ClassVar[tuple[str, ...]] = ("target_accept",)
 
     def __post_init__(self) -> None:
@@ -123,12 +120,7 @@ class DelayedAcceptance(Sampler):
     solves_fem: ClassVar[bool] = True
 
     def sample(
-        self,
-        density: Density,
-        data: Data,
-        options: DelayedAcceptanceOptions,
-        seed: int,
-        context: Context = Context(),
+        self, density: Density, data: Data, options: DelayedAcceptanceOptions, context: Context
     ) -> Draws:
         """Draw from FEM's posterior in rounds, until the chains agree.
 
@@ -141,14 +133,9 @@ class DelayedAcceptance(Sampler):
         SolverError
             FEM converged at none of a chain's first proposals.
         """
-        if context.fem is None:
-            raise InputError(f"{options.label}: there is no FEM likelihood to decide by")
         with counting(desc=self.name, total=0, disable=not context.progress, unit="draw") as bar:
-            run = _Run(density, data, options, seed, context.fem, context.checkpoint, bar)
-            for rounds in range(1, options.rounds + 1):
-                draws = run.draw(rounds * options.draws)
-                if converged(draws.z, options.r_hat, options.ess):
-                    break
+            run = _Run(density, data, options, context, bar)
+            draws = in_rounds(run.draw, options)
         return draws._replace(attributes={"fem_solves": run.solves})
 
 
@@ -160,16 +147,17 @@ class _Run:
         density: Density,
         data: Data,
         options: DelayedAcceptanceOptions,
-        seed: int,
-        fem: FEMLikelihood,
-        checkpoint: Checkpoint,
+        context: Context,
         bar: tqdm,
     ) -> None:
         self.density, self.data, self.options, self.bar = density, data, options, bar
-        self.fem, self.checkpoint = fem, checkpoint
+        self.checkpoint = context.checkpoint
+        if context.fem is None:
+            raise InputError(f"{options.label}: there is no FEM likelihood to decide by")
+        self.fem = context.fem
         self.wide = tempered(density, options.power)
         self.programs = compile_chains(BLACKJAX_NUTS, self.wide, options.cheap())
-        start_key, self.key = jax.random.split(jax.random.key(seed))
+        start_key, self.key = jax.random.split(jax.random.key(context.seed))
         state = self.checkpoint.restore(self._template) or self._begin(start_key)
         self.map_, self.position = state.map_, state.position
         self.count, self.solves = int(state.count), int(state.solves)
@@ -178,14 +166,18 @@ class _Run:
 
     def draw(self, total: int) -> Draws:
         """Return the first ``total`` draws of each chain after the discarded ones."""
-        last = self.bar.total = self.options.discarded + total
+        discarded = self.options.discarded
+        last = self.bar.total = discarded + total
         while self.count < last:
             draws = self._step()
             self.count += 1
-            if self.count > self.options.discarded:
+            if self.count > discarded:
                 self.parts.append(draws)
-            elif self.count == self.options.discarded:
-                self._check_start()
+            elif self.count == discarded and not np.isfinite(self.position.log_w).all():
+                raise SolverError(
+                    f"FEM converged at none of a chain's first {self.count + 1} proposals: the "
+                    "cheap map leads to where FEM has no solution"
+                )
             self.bar.update()
             self.checkpoint.keep(self._state)
         return jax.tree.map(lambda array: array[:, :total], join(self.parts))
@@ -195,11 +187,8 @@ class _Run:
 
         This part has no checkpoint, because it solves no FEM: a killed run repeats it.
         """
-        with counting(disable=True, total=0) as bar:
-            cheap = Chains(
-                BLACKJAX_NUTS, self.wide, self.data, self.options.cheap(), Checkpoint(), bar
-            )
-            cheap.start_straightened(*jax.random.split(key))
+        cheap = Chains(BLACKJAX_NUTS, self.wide, self.data, self.options.cheap(), Context())
+        cheap.begin(key)
         self.map_ = cheap.map_
         proposal, _ = self._propose(cheap.states)
         every = np.full(len(proposal.z), True)
@@ -264,13 +253,6 @@ class _Run:
     def _no_means(self, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
         shapes = self.fem.model.observe.shapes
         return {name: np.full((*shape, *of), np.nan) for name, of in shapes.items()}
-
-    def _check_start(self) -> None:
-        if not np.isfinite(self.position.log_w).all():
-            raise SolverError(
-                f"FEM converged at none of a chain's first {self.count + 1} proposals: the cheap "
-                "map leads to where FEM has no solution"
-            )
 
     def _no_draws(self) -> Draws:
         chains = self.options.chains

@@ -8,8 +8,9 @@ is an argument, so that programs compiled for one data set serve others of its s
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,8 +26,9 @@ from emulator.surrogates.fem import FEMForward
 from emulator.surrogates.protocol import ForwardMap
 
 
-class Target(Protocol):
-    """The interface of a density that Markov chains sample.
+@dataclass(frozen=True)
+class Target:
+    """A log density on real coordinates that Markov chains sample.
 
     log_density : (z (p,), data) -> ().
     dimension : the number of coordinates, p.
@@ -34,52 +36,30 @@ class Target(Protocol):
     at_once : the number of threads that may evaluate it at the same time.
     """
 
-    @property
-    def log_density(self) -> Callable[[jax.Array, Any], jax.Array]: ...  # noqa: D102
-
-    @property
-    def dimension(self) -> int: ...  # noqa: D102
-
-    @property
-    def piloted(self) -> bool: ...  # noqa: D102
-
-    @property
-    def at_once(self) -> int: ...  # noqa: D102
-
-    def __hash__(self) -> int: ...
+    log_density: Callable[[jax.Array, Any], jax.Array]
+    dimension: int
+    piloted: bool
+    at_once: int
 
 
-class Density(NamedTuple):
-    """A log density on real coordinates.
+@dataclass(frozen=True)
+class Density(Target):
+    """The posterior of a model; ``log_density`` is the sum of the next two.
 
-    log_density : (z (p,), data) -> (); the sum of the next two.
     log_prior : (z (p,),) -> (); the log prior density of ``z``, which integrates to 1.
     log_likelihood : (z (p,), data) -> (); ``-inf`` where the forward map has no answer.
     prior_draw : (rng_key,) -> z (p,) from the prior.
     constrain : (z (s, p),) -> draws by name, each (s,).
     unconstrain : (draw by name, each ()) -> z (p,).
     names : the names of the coordinates, (p,), in their order.
-    at_once : the number of threads that may evaluate it at the same time.
     """
 
-    log_density: Callable[[jax.Array, Data], jax.Array]
     log_prior: Callable[[jax.Array], jax.Array]
     log_likelihood: Callable[[jax.Array, Data], jax.Array]
     prior_draw: Callable[[jax.Array], jax.Array]
     constrain: Callable[[jax.Array], dict[str, jax.Array]]
     unconstrain: Callable[[Mapping[str, jax.Array]], jax.Array]
     names: tuple[str, ...]
-    at_once: int = 1
-
-    @property
-    def dimension(self) -> int:
-        """Number of coordinates, p."""
-        return len(self.names)
-
-    @property
-    def piloted(self) -> bool:
-        """Whether a pilot run straightens the density: one coordinate has no other to depend on."""
-        return self.dimension > 1
 
 
 @lru_cache(maxsize=4)
@@ -88,8 +68,13 @@ def density_of(model: Model) -> Density:
     names = tuple(sorted(model.sampled_priors))
     transforms = {name: biject_to(model.sampled_priors[name].support) for name in names}
     example = {name: np.zeros(shape) for name, shape in model.observe.shapes.items()}
-    # By name: the Jacobian of a coordinate is a site too, and counts as observed.
-    hidden = _observed_sites(model, example)
+    hidden: list[str] = []  # by name: the Jacobian of a coordinate is a site too, and observed
+
+    def hide() -> None:
+        sites = handlers.trace(handlers.seed(model, jax.random.key(0))).get_trace(example)
+        hidden.extend(name for name, site in sites.items() if site.get("is_observed", False))
+
+    jax.eval_shape(hide)  # which computes nothing
 
     def coordinates(z: jax.Array) -> dict[str, jax.Array]:
         return dict(zip(names, z, strict=True))
@@ -115,14 +100,16 @@ def density_of(model: Model) -> Density:
         return jnp.stack([transforms[name].inv(draw[name]) for name in names])
 
     return Density(
-        log_density,
-        log_prior,
-        log_likelihood,
-        prior_draw,
-        jax.jit(jax.vmap(draw)),
-        unconstrain,
-        names,
-        threads_for(model.forward),
+        log_density=log_density,
+        dimension=len(names),
+        piloted=len(names) > 1,  # one coordinate has no other to depend on
+        at_once=threads_for(model.forward),
+        log_prior=log_prior,
+        log_likelihood=log_likelihood,
+        prior_draw=prior_draw,
+        constrain=jax.jit(jax.vmap(draw)),
+        unconstrain=unconstrain,
+        names=names,
     )
 
 
@@ -140,19 +127,7 @@ def tempered(density: Density, power: float) -> Density:
     def log_density(z: jax.Array, data: Data) -> jax.Array:
         return density.log_prior(z) + power * density.log_likelihood(z, data)
 
-    return density._replace(log_density=log_density)
-
-
-def _observed_sites(model: Model, data: dict[str, np.ndarray]) -> list[str]:
-    """Return the names of observed sites and of factors, without computing anything."""
-    names: list[str] = []
-
-    def trace() -> None:
-        sites = handlers.trace(handlers.seed(model, jax.random.key(0))).get_trace(data)
-        names.extend(name for name, site in sites.items() if site.get("is_observed", False))
-
-    jax.eval_shape(trace)
-    return names
+    return replace(density, log_density=log_density)
 
 
 def named_draws(model: Model, z: np.ndarray) -> dict[str, np.ndarray]:

@@ -70,11 +70,6 @@ def effective(weights: np.ndarray) -> float:
     return 1.0 / square if square > 0.0 else 0.0
 
 
-def efficiency(log_weights: np.ndarray) -> float:
-    """Return the effective fraction of weights (s,): (sum w)^2 / (s sum w^2)."""
-    return effective(normalised(log_weights)) / len(log_weights)
-
-
 def smoothed(log_weights: np.ndarray) -> tuple[np.ndarray, float]:
     """Return log weights (s,) of sum 1 with a smoothed tail, and the tail's Pareto shape.
 

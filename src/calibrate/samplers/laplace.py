@@ -30,7 +30,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -38,8 +38,8 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from calibrate.samplers.density import Density
-from calibrate.samplers.diagnostics import FEWEST_WEIGHTS, efficiency, pareto_shape
-from calibrate.samplers.protocol import Context, Draws, Sampler, check_numbers
+from calibrate.samplers.diagnostics import FEWEST_WEIGHTS, effective, normalised, pareto_shape
+from calibrate.samplers.protocol import Context, Draws, Options, Sampler
 from calibrate.statistical_model import Data
 from emulator.core.errors import InputError, SolverError
 from emulator.core.minimise import minimise
@@ -61,7 +61,7 @@ _SAMPLE = 64  # draws from which the mean log density is computed
 
 
 @dataclass(frozen=True)
-class LaplaceOptions:
+class LaplaceOptions(Options):
     """Size of a run.
 
     draws, chains : the number of independent draws of a set, and of sets.
@@ -74,16 +74,9 @@ class LaplaceOptions:
     starts: int = _STARTS
 
     label: ClassVar[str] = "Laplace"
-    counts: ClassVar[tuple[str, ...]] = ("draws", "chains", "starts")
-    shares: ClassVar[tuple[str, ...]] = ()
-
-    @classmethod
-    def sized(cls, *, warmup: int, draws: int, chains: int) -> Self:  # noqa: ARG003
-        """Return options of a run of this size; there is no warm-up."""
-        return cls(draws=draws, chains=chains)
 
     def __post_init__(self) -> None:
-        check_numbers(self)
+        super().__post_init__()
         if self.draws * self.chains < FEWEST_WEIGHTS:
             raise InputError(
                 f"{self.label}: {self.draws} draws of {self.chains} chains; give {FEWEST_WEIGHTS} "
@@ -103,12 +96,7 @@ class Laplace(Sampler):
     """The sampler of the Laplace approximation."""
 
     def sample(
-        self,
-        density: Density,
-        data: Data,
-        options: LaplaceOptions,
-        seed: int,
-        context: Context = Context(),
+        self, density: Density, data: Data, options: LaplaceOptions, context: Context
     ) -> Draws:
         """Return independent draws of the Gaussian where the density is not zero.
 
@@ -122,15 +110,28 @@ class Laplace(Sampler):
             No mode exists, the density is flat there, or half of the Gaussian lies where it is
             zero.
         """
-        start_key, key = jax.random.split(jax.random.key(seed))
-        gaussian = context.checkpoint.restore(lambda: _empty(density.dimension))
+        start_key, key = jax.random.split(jax.random.key(context.seed))
+        number = np.zeros(())
+        template = _Gaussian(number, number, Modes(number, number))
+        gaussian = context.checkpoint.restore(lambda: template)
         if gaussian is None:
             modes = find_modes(density, data, start_key, options.starts)
             if not len(modes.z):
                 raise SolverError(
                     "the posterior density is zero wherever the optimiser could start"
                 )
-            gaussian = _Gaussian(modes.z[0], _precision(density, data, modes.z[0]), modes)
+            precision, smallest, distance = _curvature(density, data, modes.z[0])
+            if not smallest > 0.0:
+                raise SolverError(
+                    f"the posterior has no curvature at its mode in some direction ({smallest:.2g})"
+                    ": it is flat there, or ends; use a sampler, such as nuts"
+                )
+            if not distance < _AWAY:
+                raise SolverError(
+                    f"the optimiser stopped {distance:.2g} sd from a mode: the posterior density "
+                    "ends or bends sharply there; use a sampler, such as nuts"
+                )
+            gaussian = _Gaussian(modes.z[0], precision, modes)
             context.checkpoint.keep(lambda: gaussian)
         z, lp, log_q = _draw(density, gaussian, data, options, key)
         shape = (options.chains, options.draws)
@@ -138,34 +139,13 @@ class Laplace(Sampler):
         attributes = {
             "approximation": "gaussian",
             "pareto_k": pareto_shape(lp - log_q),
-            "importance_efficiency": efficiency(lp - log_q),
-            **missed_mode(density, data, z, Modes(*gaussian.modes)),
+            "importance_efficiency": effective(normalised(lp - log_q)) / len(lp),
+            **missed_mode(density, data, z, gaussian.modes),
         }
         return Draws(z.reshape(*shape, -1), statistics, attributes)
 
 
 LAPLACE = Laplace("laplace", LaplaceOptions, ("lp", "log_ratio"))
-
-
-def _empty(size: int) -> _Gaussian:
-    modes = Modes(np.zeros((0, size)), np.zeros(0))
-    return _Gaussian(np.zeros(size), np.zeros((size, size)), modes)
-
-
-def _precision(density: Density, data: Data, mode: np.ndarray) -> np.ndarray:
-    """Return minus the Hessian at the mode; :class:`SolverError` where it is no mode."""
-    precision, smallest, distance = _curvature(density, data, mode)
-    if not smallest > 0.0:
-        raise SolverError(
-            f"the posterior has no curvature at its mode in some direction ({smallest:.2g}): it is "
-            "flat there, or ends; use a sampler, such as nuts"
-        )
-    if not distance < _AWAY:
-        raise SolverError(
-            f"the optimiser stopped {distance:.2g} sd from a mode: the posterior density ends or "
-            "bends sharply there; use a sampler, such as nuts"
-        )
-    return precision
 
 
 def _draw(
@@ -274,9 +254,15 @@ def missed_mode(density: Density, data: Data, z: np.ndarray, modes: Modes) -> di
         lowest = min(height(each) for each in mode + way * (nearest - mode))
         if not lowest < min(top, height(nearest)) - _VALLEY:
             continue
-        lighter = float(log_mass_of_draws - _log_mass(density, data, mode, top))
+        precision, smallest, distance = _curvature(density, data, mode)
+        if not (smallest > 0.0 and distance < _AWAY_OF_MASS):  # flat there, or no mode
+            continue
+        log_mass = top + 0.5 * (len(mode) * np.log(2.0 * np.pi) - np.linalg.slogdet(precision)[1])
+        lighter = float(log_mass_of_draws - log_mass)
         if lighter < min(attributes[MISSED_BY], _LIGHTER):
-            attributes = {MISSED_BY: lighter, MISSED_AT: _in_words(density, mode)}
+            named = density.constrain(jnp.asarray(mode)[None])
+            words = ", ".join(f"{name} {float(value[0]):.4g}" for name, value in named.items())
+            attributes = {MISSED_BY: lighter, MISSED_AT: words}
     return attributes
 
 
@@ -286,20 +272,6 @@ def _covariance(draws: np.ndarray) -> np.ndarray | None:
     if not np.isfinite(covariance).all() or not np.linalg.eigvalsh(covariance)[0] > 0.0:
         return None
     return covariance
-
-
-def _in_words(density: Density, z: np.ndarray) -> str:
-    named = density.constrain(jnp.asarray(z)[None])
-    return ", ".join(f"{name} {float(value[0]):.4g}" for name, value in named.items())
-
-
-def _log_mass(density: Density, data: Data, mode: np.ndarray, top: float) -> float:
-    """Return the log of Laplace's mass; none where the density is flat or ``mode`` is no mode."""
-    precision, smallest, distance = _curvature(density, data, mode)
-    if not (smallest > 0.0 and distance < _AWAY_OF_MASS):
-        return -np.inf
-    log_det = np.linalg.slogdet(precision)[1]
-    return float(top + 0.5 * (len(mode) * np.log(2.0 * np.pi) - log_det))
 
 
 def _curvature(density: Density, data: Data, z: np.ndarray) -> tuple[np.ndarray, float, float]:

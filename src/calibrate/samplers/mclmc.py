@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from calibrate.samplers.chains import ChainSampler
-from calibrate.samplers.protocol import ChainOptions, Kernel, Statistics, TunedState
+from calibrate.samplers.protocol import ChainOptions, Kernel, TunedState, tuned_step
 from emulator.core.errors import InputError
 
 # Parts of the warm-up: step size, then the metric, then the step size again.
@@ -80,24 +80,7 @@ def kernel(log_density: Callable[..., jax.Array], options: MCLMCOptions) -> Kern
         )
         return TunedState(next_key, state, tuned.step_size, tuned.inverse_mass_matrix)
 
-    def step(state: TunedState, *arguments: Any) -> tuple[TunedState, jax.Array, Statistics]:
-        transition_key, next_key = jax.random.split(state.rng_key)
-        inner, info = transition(
-            transition_key,
-            state.state,
-            lambda zeta: log_density(zeta, *arguments),
-            state.step_size,
-            inverse_mass_matrix=state.inverse_mass_matrix,
-            integration_steps_params=(options.leapfrogs,),
-        )
-        statistics = {
-            "diverging": info.is_divergent,
-            "acceptance_rate": info.acceptance_rate,
-            "n_steps": info.num_integration_steps,
-            "lp": inner.logdensity,
-        }
-        return state._replace(rng_key=next_key, state=inner), inner.position, statistics
-
+    step = tuned_step(log_density, transition, integration_steps_params=(options.leapfrogs,))
     return Kernel(init, step)
 
 

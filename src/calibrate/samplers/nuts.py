@@ -17,7 +17,7 @@ import jax
 from numpyro.infer.hmc import hmc
 
 from calibrate.samplers.chains import ChainSampler
-from calibrate.samplers.protocol import ChainOptions, Kernel, Statistics, TunedState
+from calibrate.samplers.protocol import ChainOptions, Kernel, Statistics, TunedState, tuned_step
 
 
 @dataclass(frozen=True)
@@ -35,10 +35,7 @@ class NUTSOptions(ChainOptions):
 
 @dataclass(frozen=True)
 class BlackJAXNUTSOptions(NUTSOptions):
-    """Length of a run.
-
-    target_accept : the acceptance rate in (0, 1) that the step size adapts to.
-    """
+    """Length of a run."""
 
     label: ClassVar[str] = "BlackJAX NUTS"
 
@@ -80,8 +77,6 @@ def blackjax_kernel(log_density: Callable[..., jax.Array], options: BlackJAXNUTS
     import blackjax  # only some samplers need this import
     from blackjax.adaptation.base import get_filter_adapt_info_fn
 
-    transition = blackjax.nuts.build_kernel()
-
     def init(rng_key: jax.Array, position: jax.Array, *arguments: Any) -> TunedState:
         adaptation_key, next_key = jax.random.split(rng_key)
         adaptation = blackjax.window_adaptation(
@@ -94,26 +89,8 @@ def blackjax_kernel(log_density: Callable[..., jax.Array], options: BlackJAXNUTS
         (state, tuned), _ = adaptation.run(adaptation_key, position, options.warmup)
         return TunedState(next_key, state, tuned["step_size"], tuned["inverse_mass_matrix"])
 
-    def step(state: TunedState, *arguments: Any) -> tuple[TunedState, jax.Array, Statistics]:
-        transition_key, next_key = jax.random.split(state.rng_key)
-        nuts, info = transition(
-            transition_key,
-            state.state,
-            lambda zeta: log_density(zeta, *arguments),
-            state.step_size,
-            state.inverse_mass_matrix,
-        )
-        statistics = {
-            "diverging": info.is_divergent,
-            "acceptance_rate": info.acceptance_rate,
-            "n_steps": info.num_integration_steps,
-            "lp": nuts.logdensity,
-            "energy": info.energy,
-            "tree_depth": info.num_trajectory_expansions,
-        }
-        return state._replace(rng_key=next_key, state=nuts), nuts.position, statistics
-
-    return Kernel(init, step)
+    more = {"energy": "energy", "tree_depth": "num_trajectory_expansions"}
+    return Kernel(init, tuned_step(log_density, blackjax.nuts.build_kernel(), more))
 
 
 _STATISTICS = ("diverging", "acceptance_rate", "n_steps", "lp", "energy")

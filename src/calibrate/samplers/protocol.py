@@ -1,17 +1,16 @@
 """What a sampler provides: its name, options, statistics, and draws from a density.
 
-:mod:`calibrate.samplers.registry` finds a sampler by name. Samplers that are Markov chains give a
-:class:`Kernel` and options that extend :class:`ChainOptions`, and leave the rest to
-:class:`~calibrate.samplers.chains.ChainSampler`; a sampler of another kind (particles, an
-approximation) implements :meth:`Sampler.sample` itself.
+Samplers that are Markov chains give a :class:`Kernel` and options that extend
+:class:`ChainOptions`, and leave the rest to :class:`~calibrate.samplers.chains.ChainSampler`; a
+sampler of another kind (particles, an approximation) implements :meth:`Sampler.sample` itself.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple, Self
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 
@@ -41,13 +40,15 @@ class Draws(NamedTuple):
 
 
 class Context(NamedTuple):
-    """The inputs of a run besides its density.
+    """The inputs of a run besides density, data and options.
 
+    seed : the seed of all random numbers.
     progress : whether a progress bar is shown.
     checkpoint : the file that the run's state is written to, and restored from after a kill.
     fem : FEM's log likelihood, for samplers with FEM in a second stage.
     """
 
+    seed: int = 0
     progress: bool = False
     checkpoint: Checkpoint = Checkpoint()
     fem: FEMLikelihood | None = None
@@ -70,9 +71,7 @@ class Sampler(ABC):
     """Whether the sampler needs FEM's likelihood (:attr:`Context.fem`)."""
 
     @abstractmethod
-    def sample(
-        self, density: Any, data: Any, options: Any, seed: int, context: Context = Context()
-    ) -> Draws:
+    def sample(self, density: Any, data: Any, options: Any, context: Context) -> Draws:
         """Draw from ``density`` given ``data``."""
 
 
@@ -101,8 +100,50 @@ class TunedState(NamedTuple):
     inverse_mass_matrix: jax.Array
 
 
+def tuned_step(
+    log_density: Callable[..., jax.Array],
+    transition: Callable[..., Any],
+    statistics: Mapping[str, str] = {},
+    **options: Any,
+) -> Callable[..., tuple[TunedState, jax.Array, Statistics]]:
+    """Return the ``step`` of a :class:`Kernel` by BlackJAX's ``transition``.
+
+    statistics : further statistics, with the name of each in BlackJAX's information.
+    """
+    names = {"diverging": "is_divergent", "acceptance_rate": "acceptance_rate"}
+    names |= {"n_steps": "num_integration_steps", **statistics}
+
+    def step(state: TunedState, *arguments: Any) -> tuple[TunedState, jax.Array, Statistics]:
+        transition_key, next_key = jax.random.split(state.rng_key)
+        inner, info = transition(
+            transition_key, state.state, lambda zeta: log_density(zeta, *arguments),
+            step_size=state.step_size, inverse_mass_matrix=state.inverse_mass_matrix, **options,
+        )  # fmt: skip
+        values = {name: getattr(info, theirs) for name, theirs in names.items()}
+        values["lp"] = inner.logdensity
+        return state._replace(rng_key=next_key, state=inner), inner.position, values
+
+    return step
+
+
 @dataclass(frozen=True)
-class ChainOptions:
+class Options:
+    """Settings of a sampler: whole numbers of 1 or more, and ``shares`` in (0, 1)."""
+
+    label: ClassVar[str]
+    shares: ClassVar[tuple[str, ...]] = ()
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.type in (int, "int") and value < 1:
+                raise InputError(f"{self.label}: {field.name} is {value}; it must be 1 or more")
+            if field.name in self.shares and not 0.0 < value < 1.0:
+                raise InputError(f"{self.label}: {field.name} is {value}; give one in (0, 1)")
+
+
+@dataclass(frozen=True)
+class ChainOptions(Options):
     """Length of a run.
 
     warmup : the number of adapting iterations, whose draws are dropped.
@@ -123,16 +164,9 @@ class ChainOptions:
     start: str = RANDOM
 
     label: ClassVar[str] = "chains"
-    counts: ClassVar[tuple[str, ...]] = ("warmup", "draws", "chains", "rounds")
-    shares: ClassVar[tuple[str, ...]] = ()
-
-    @classmethod
-    def sized(cls, *, warmup: int, draws: int, chains: int) -> Self:
-        """Return options of a run of this length, all else by default."""
-        return cls(warmup=warmup, draws=draws, chains=chains)
 
     def __post_init__(self) -> None:
-        check_numbers(self)
+        super().__post_init__()
         if self.start not in (RANDOM, PATHFINDER):
             raise InputError(
                 f"{self.label}: start is '{self.start}'; it is {RANDOM} or {PATHFINDER}"
@@ -141,13 +175,3 @@ class ChainOptions:
             raise InputError(f"{self.label}: r_hat is {self.r_hat}; it must be above 1")
         if not self.ess >= 0.0:
             raise InputError(f"{self.label}: ess is {self.ess}; it must be 0 or more")
-
-
-def check_numbers(options: Any) -> None:
-    """Raise an :class:`InputError` unless ``counts`` are 1 or more and ``shares`` in (0, 1)."""
-    for name in options.counts:
-        if (value := getattr(options, name)) < 1:
-            raise InputError(f"{options.label}: {name} is {value}; it must be 1 or more")
-    for name in options.shares:
-        if not 0.0 < (value := getattr(options, name)) < 1.0:
-            raise InputError(f"{options.label}: {name} is {value}; give one in (0, 1)")

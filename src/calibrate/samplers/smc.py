@@ -21,16 +21,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, ClassVar, NamedTuple, Self
+from operator import itemgetter
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import logsumexp
-from tqdm import tqdm
 
 from calibrate.samplers.density import Density
-from calibrate.samplers.protocol import Context, Draws, Sampler, check_numbers
+from calibrate.samplers.protocol import Context, Draws, Options, Sampler
 from calibrate.statistical_model import Data
 from emulator.core.errors import SolverError
 from emulator.core.progress import counting
@@ -41,7 +41,7 @@ _LOWEST = -1e10
 
 
 @dataclass(frozen=True)
-class SMCOptions:
+class SMCOptions(Options):
     """Size of a run.
 
     draws : the number of particles of a set.
@@ -62,18 +62,7 @@ class SMCOptions:
     temperatures: int = 200
 
     label: ClassVar[str] = "SMC"
-    counts: ClassVar[tuple[str, ...]] = (
-        "draws", "chains", "transitions", "leapfrogs", "temperatures",
-    )  # fmt: skip
     shares: ClassVar[tuple[str, ...]] = ("target_accept", "survivors")
-
-    @classmethod
-    def sized(cls, *, warmup: int, draws: int, chains: int) -> Self:  # noqa: ARG003
-        """Return options of a run of this size; particles have no warm-up."""
-        return cls(draws=draws, chains=chains)
-
-    def __post_init__(self) -> None:
-        check_numbers(self)
 
 
 class _Particles(NamedTuple):
@@ -98,14 +87,7 @@ class _State(NamedTuple):
 class TemperedSMC(Sampler):
     """The sampler of tempered sequential Monte Carlo."""
 
-    def sample(
-        self,
-        density: Density,
-        data: Data,
-        options: SMCOptions,
-        seed: int,
-        context: Context = Context(),
-    ) -> Draws:
+    def sample(self, density: Density, data: Data, options: SMCOptions, context: Context) -> Draws:
         """Return the particles of all sets, one set after the other, and the evidence.
 
         The attribute ``log_evidence`` is the logarithm of the sets' mean evidence,
@@ -117,9 +99,34 @@ class TemperedSMC(Sampler):
         SolverError
             A set of particles did not reach the posterior in ``options.temperatures`` steps.
         """
-        programs = _compile(density, options)
+        programs, checkpoint = _compile(density, options), context.checkpoint
+        keys = jax.random.split(jax.random.key(context.seed), options.chains)
+        template = jax.eval_shape(programs.start, keys[0])
+        state = checkpoint.restore(lambda: _State(template, template))
+        done: list[_Particles] = []
+        current: Any = None
+        if state is not None:
+            count, current = len(state.done.steps), state.current
+            done = [jax.tree.map(itemgetter(k), state.done) for k in range(count)]
         with counting(desc=self.name, total=options.chains, disable=not context.progress) as bar:
-            sets = _run(programs, data, options, seed, context, bar)
+            bar.update(len(done))
+            while len(done) < options.chains:
+                current = programs.start(keys[len(done)]) if current is None else current
+                while current.temperature < 1.0:
+                    current = jax.tree.map(np.asarray, programs.step(current, data))
+                    bar.set_postfix(temperature=f"{float(current.temperature):.2g}")
+                    if current.steps >= options.temperatures and current.temperature < 1.0:
+                        raise SolverError(
+                            f"{options.label}: a population is at temperature "
+                            f"{float(current.temperature):.2g} after {options.temperatures} steps; "
+                            "allow more temperatures, or look at the likelihood: it may be flat or "
+                            "very sharp"
+                        )
+                    checkpoint.keep(lambda: _State(_stack(done, template), current))  # noqa: B023
+                done.append(current)
+                bar.update()
+                current = None
+        sets = _stack(done, template)
         statistics = {
             "acceptance_rate": np.asarray(sets.acceptance_rate),
             "lp": np.asarray(programs.finish(sets.particles, data)),
@@ -142,43 +149,10 @@ def evidence(logarithms: np.ndarray) -> dict[str, float]:
     return attributes
 
 
-def _run(
-    programs: _Programs, data: Data, options: SMCOptions, seed: int, context: Context, bar: tqdm
-) -> _Particles:
-    """Return all sets of particles at temperature 1, stacked."""
-    keys = jax.random.split(jax.random.key(seed), options.chains)
-    template = jax.eval_shape(programs.start, keys[0])
-    state = context.checkpoint.restore(lambda: _State(template, template))
-    finished_sets = [] if state is None else _unstack(state.done)
-    current = programs.start(keys[0]) if state is None else state.current
-    bar.update(len(finished_sets))
-    while True:
-        while current.temperature < 1.0:
-            current = jax.tree.map(np.asarray, programs.step(current, data))
-            bar.set_postfix(temperature=f"{float(current.temperature):.2g}")
-            if current.steps >= options.temperatures and current.temperature < 1.0:
-                raise SolverError(
-                    f"{options.label}: a population is at temperature "
-                    f"{float(current.temperature):.2g} after {options.temperatures} steps; allow "
-                    "more temperatures, or look at the likelihood: it may be flat or very sharp"
-                )
-            context.checkpoint.keep(lambda: _State(_stack(finished_sets, template), current))  # noqa: B023
-        finished_sets.append(current)
-        bar.update()
-        if len(finished_sets) == options.chains:
-            return _stack(finished_sets, template)
-        current = programs.start(keys[len(finished_sets)])
-
-
 def _stack(sets: list[_Particles], template: Any) -> _Particles:
     if not sets:
         return jax.tree.map(lambda leaf: np.zeros((0, *leaf.shape), leaf.dtype), template)
     return jax.tree.map(lambda *leaves: np.stack(leaves), *sets)
-
-
-def _unstack(sets: _Particles) -> list[_Particles]:
-    count = len(sets.temperature)
-    return [jax.tree.map(lambda leaf: leaf[k], sets) for k in range(count)]  # noqa: B023
 
 
 class _Programs(NamedTuple):

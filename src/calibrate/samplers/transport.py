@@ -77,12 +77,6 @@ def coefficient_count(dimension: int) -> int:
     return max(counts, default=0)
 
 
-def identity(dimension: int) -> TransportMap:
-    """Return the identity map."""
-    shape = (dimension, coefficient_count(dimension))
-    return TransportMap(jnp.arange(dimension), jnp.zeros(shape))
-
-
 def apply(map_: TransportMap, zeta: jax.Array) -> jax.Array:
     """Return ``z`` (p,) from ``zeta`` (p,)."""
     if not map_.coefficients.size:
@@ -129,19 +123,14 @@ def fit(draws: np.ndarray) -> TransportMap:
     dimension = draws.shape[1]
     squashed = expit(draws)
     order = np.argsort(-squashed.std(axis=0), kind="stable")
-    start = identity(dimension)
-    coefficients = np.array(start.coefficients)
+    coefficients = np.zeros((dimension, coefficient_count(dimension)))
     for k in range(1, dimension):
         terms = monomials(squashed[:, order], k)
         target = draws[:, order[k]]
         # Ridge penalty: features that a short pilot hardly varied get small coefficients.
         sd = np.maximum(terms.std(axis=0), 1e-12)
-        design = np.vstack(
-            [
-                (terms - terms.mean(axis=0)) / sd,
-                1e-3 * np.eye(terms.shape[1]) * len(terms) ** 0.5,
-            ]
-        )
+        ridge = 1e-3 * np.eye(terms.shape[1]) * len(terms) ** 0.5
+        design = np.vstack([(terms - terms.mean(axis=0)) / sd, ridge])
         values = np.concatenate([target - target.mean(), np.zeros(terms.shape[1])])
         coefficients[k, : terms.shape[1]] = np.linalg.lstsq(design, values, rcond=None)[0] / sd
     return TransportMap(jnp.asarray(order), jnp.asarray(coefficients))
@@ -149,9 +138,8 @@ def fit(draws: np.ndarray) -> TransportMap:
 
 def standard_identity(dimension: int, *, bends: bool = True) -> StandardMap:
     """Return the identity map; without ``bends`` it has no coefficients at all."""
-    bend = identity(dimension)
-    if not bends:
-        bend = TransportMap(bend.order, jnp.zeros((dimension, 0)))
+    coefficients = jnp.zeros((dimension, coefficient_count(dimension) if bends else 0))
+    bend = TransportMap(jnp.arange(dimension), coefficients)
     return StandardMap(bend, jnp.zeros(dimension), jnp.ones(dimension))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import emulator as em
-from calibrate.analysis.evaluation import Evaluation, run_evaluation
+from calibrate.analysis.evaluation import run_evaluation
 from calibrate.cli import main
 from emulator.core.errors import InputError
 from emulator.fem.campaign.designs import fem_reference
@@ -37,9 +37,9 @@ def reference(folder):
 @pytest.mark.slow
 def test_newton_steps_square_the_error(folder, reference, monkeypatch):
     monkeypatch.setattr("calibrate.analysis.evaluation.fem_reference", lambda *_, **__: reference)
-    base = run_evaluation(Evaluation(folder)).report
+    base = run_evaluation(folder).report
     once, thrice = (
-        run_evaluation(Evaluation(folder, forward="corrected", forward_options={"steps": k})).report
+        run_evaluation(folder, forward="corrected", forward_options={"steps": k}).report
         for k in (1, 3)
     )
     medians = [report["err_u"]["median"] for report in (base, once, thrice)]
@@ -96,9 +96,9 @@ def test_bad_calls(folder, capsys, words, message):
 
 def test_plans_that_cannot_be_carried_out():
     with pytest.raises(InputError, match="forward map 'spline' is unknown; known: emulator, corr"):
-        Evaluation("x", forward="spline")
+        run_evaluation("x", forward="spline")
     with pytest.raises(InputError, match="--steps has no effect without --forward corrected"):
-        Evaluation("x", forward_options={"steps": 2})
+        run_evaluation("x", forward_options={"steps": 2})
 
 
 def test_evaluating_imports_no_figures():

@@ -11,9 +11,8 @@ import pytest
 import calibrate as cal
 import emulator as em
 from calibrate.analysis import expected
-from calibrate.analysis.expected import expected_precision
-from calibrate.analysis.identifiability import next_measurement, stress_band, stresses
-from calibrate.analysis.profile import profile_likelihood
+from calibrate.analysis.expected import expected_precision, next_measurement
+from calibrate.analysis.identifiability import profile_likelihood, stress_band, stresses
 from calibrate.posterior import Posterior
 from emulator.core.errors import InputError
 from linear_support import closed_form, linear_forward

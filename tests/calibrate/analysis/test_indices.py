@@ -9,7 +9,7 @@ import numpyro.distributions as dist
 import pytest
 from scipy.stats import truncnorm
 
-from calibrate.analysis.indices import Factors, analyse, densities, quantiles
+from calibrate.analysis.sensitivity import Factors, analyse, densities, quantiles
 from calibrate.priors import truncated_normal
 from emulator.core.errors import InputError
 

@@ -47,7 +47,7 @@ def test_shifts_are_those_of_the_quadrature(fem, check, stretch, shift):
     data, found = check
     model = found.posterior.model
     fine, differences = finer_than(fem, model, stretch, shift)
-    by_fem = lambda z: differences(z, found.predictive)
+    by_fem = lambda z: differences(z, found.pool.predictive)
     told = change_by(by_fem, found.pool, found.tests.runs, 8, np.random.default_rng(0))
     points, weights, moved = grid_of(), quadrature(fem, data), quadrature(fine, data)
     mean, after = weights @ points, moved @ points
@@ -66,7 +66,7 @@ def test_failures_on_the_finer_mesh_leave_it_open(check):
     failures = lambda z: [None] * len(z)
     told = change_by(failures, found.pool, found.tests.runs, 8, np.random.default_rng(0))
     assert told.failed == 8
-    assert told.within() is None
+    assert not told.shift
     certificate = judge(replace(found.certificate.evidence, mesh=told))
     assert certificate.verdict == "undecided"
     assert "FEM failed at 8 of 8 points on a finer mesh" in certificate.reason
@@ -79,7 +79,9 @@ def test_the_verdict_follows_the_mesh(check):
     assert found.certificate.reason.endswith("on this mesh")
 
     def verdict(shift, error=0.01, log_sd=0.0):
-        row = MeshChange({"mu": Figure(shift, error)}, {"mu": Figure(log_sd, 0.01)}, 900, 8)
+        row = MeshChange(
+            {"mu": Figure(shift, error)}, {"mu": Figure(log_sd, 0.01)}, nodes=900, runs=8
+        )
         return judge(replace(evidence, mesh=row))
 
     assert verdict(0.1).verdict == "accepted"

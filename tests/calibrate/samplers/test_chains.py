@@ -1,6 +1,7 @@
 """Chains: starts by Pathfinder (in the bulk, in both modes, where random ones fail), threads."""
 
 import threading
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 import calibrate as cal
-from calibrate.samplers import NUTSOptions, density_of
+from calibrate.samplers import Context, NUTSOptions, density_of
 from calibrate.samplers.chains import Programs, pathfinder_start
 from calibrate.samplers.nuts import NUTS
 from emulator.core.errors import InputError
@@ -93,6 +94,6 @@ def test_chains_run_side_by_side_and_draw_what_they_draw_alone(beam):
 
     def drawn(at_once):
         options = NUTSOptions(draws=40, warmup=40, rounds=1)
-        return NUTS.sample(posterior._replace(at_once=at_once), data, options, seed=3)
+        return NUTS.sample(replace(posterior, at_once=at_once), data, options, Context(seed=3))
 
     np.testing.assert_array_equal(drawn(3).z, drawn(1).z)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import calibrate as cal
-from calibrate.samplers import SAMPLERS
+from calibrate.samplers import SAMPLERS, options_from
 from calibrate.samplers.checkpoint import Checkpoint
 from emulator.core.errors import InputError
 from linear_support import LinearFEM, linear_problem
@@ -41,7 +41,7 @@ def problem(beam):
 def run(problem, name, **more):
     model, data = problem
     draws = 20 if SAMPLERS[name].solves_fem else 120
-    options = SAMPLERS[name].options.sized(warmup=60, draws=draws, chains=2)
+    options = options_from(SAMPLERS[name], {}, warmup=60, draws=draws, chains=2)
     more["simulator"] = LinearFEM(model.full.scene, model.full)
     return cal.sample(model, data, sampler=name, options=options, seed=5, predictions=False, **more)
 

@@ -7,7 +7,8 @@ from scipy.stats import norm
 
 from calibrate.samplers.diagnostics import (
     converged,
-    efficiency,
+    effective,
+    normalised,
     pareto_shape,
     r_hat,
     smoothed,
@@ -48,8 +49,8 @@ def test_weights_without_a_tail_stay_as_they_are(log_weights, shape):
 
 
 def test_the_efficiency_of_two_weights():
-    # (1 + 3)^2 / (2 (1 + 9))
-    assert efficiency(np.log([1.0, 3.0]) - 700.0) == pytest.approx(0.8)
+    # (1 + 3)^2 / (1 + 9)
+    assert effective(normalised(np.log([1.0, 3.0]) - 700.0)) == pytest.approx(1.6)
 
 
 def test_r_hat_of_one_chain_sees_a_drift():

@@ -114,14 +114,14 @@ RNG = np.random.default_rng(0)
 def density(log_density, size, spread=3.0):
     """A density given in unconstrained coordinates; its prior only gives the starts."""
     return Density(
-        lambda z, data: log_density(z),
+        lambda z, data: log_density(z), size, size > 1, 1,
         lambda z: jnp.zeros(()),
         lambda z, data: log_density(z),
         lambda key: spread * jax.random.normal(key, (size,)),
         lambda z: {f"z{i}": z[:, i] for i in range(size)},
         lambda draw: jnp.stack(list(draw.values())),
         tuple(f"z{i}" for i in range(size)),
-    )
+    )  # fmt: skip
 
 
 def missed(log_density, draws):

@@ -33,7 +33,7 @@ def test_a_linear_gaussian_posterior_is_the_known_one(name, problem, beam):
     model, data = problem
     # FEM in a second stage: a draw costs a solve, and is nearly independent of the one before.
     draws = 250 if find_sampler(name).solves_fem else 1000
-    options = find_sampler(name).options.sized(warmup=400, draws=draws, chains=4)
+    options = options_from(find_sampler(name), {}, warmup=400, draws=draws, chains=4)
     posterior = cal.sample(
         model, data, sampler=name, options=options, seed=1, simulator=LinearFEM(beam, model.full)
     )

@@ -53,8 +53,13 @@ def _before(arguments: Namespace) -> Answer:
 )
 def _after(arguments: Namespace) -> Answer:
     """Find what a posterior's data determined, and which measurement would add most."""
-    from calibrate.analysis.identifiability import identify, in_words, next_measurement, stress_band
-    from calibrate.analysis.profile import profile_likelihood
+    from calibrate.analysis.expected import next_measurement
+    from calibrate.analysis.identifiability import (
+        identify,
+        in_words,
+        profile_likelihood,
+        stress_band,
+    )
     from calibrate.measurements import parse_observation
     from calibrate.project import read_posterior
 

@@ -148,16 +148,19 @@ def prediction_summary(result: dict[str, Any]) -> str:
 )
 def evaluate(arguments: Namespace) -> Answer:
     """Compare a forward map with stored or fresh FEM solutions."""
-    from calibrate.analysis.evaluation import Evaluation, run_evaluation
+    from calibrate.analysis.evaluation import run_evaluation
 
     options = words.forward_options(arguments)
-    plan = Evaluation(**words.parameters(Evaluation, arguments), forward_options=options)
     if arguments.out:
         from calibrate.figures import pyplot
 
         check_folder(arguments.out)
         pyplot()  # a missing plotting package is reported before minutes of FEM
-    evaluated = run_evaluation(plan, progress=not arguments.json)
+    evaluated = run_evaluation(
+        **words.parameters(run_evaluation, arguments),
+        forward_options=options,
+        progress=not arguments.json,
+    )
     report = dict(evaluated.report)
     text = evaluation_summary(report)
     if arguments.out:
