@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from emulator.surrogates import Architecture, Emulator, augment
-from emulator.surrogates.network.part import Network, fresh
+from emulator.surrogates.network import Network, fresh
 from emulator.surrogates.taylor import constant
 
 SMALL = Architecture(steps=2, latent=8, hidden=(16, 16))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
@@ -26,8 +27,9 @@ class Handler(BaseHTTPRequestHandler):
         host = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get("Host", "")
         return self.server.server_address[0] == LOOPBACK and host not in _OF_THIS_MACHINE
 
-    def send(self, code: int, content: bytes, kind: str) -> None:
-        """Answer with ``content`` of the media type ``kind``."""
+    def send(self, code: int, content: Any, kind: str = "application/json") -> None:
+        """Answer with ``content`` of the media type ``kind``; what is not bytes becomes JSON."""
+        content = content if isinstance(content, bytes) else json.dumps(content).encode()
         self.send_response(code)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(content)))
@@ -42,8 +44,6 @@ class Handler(BaseHTTPRequestHandler):
 class Server(ThreadingHTTPServer):
     """A server of several threads that answer requests about one ``subject``."""
 
-    daemon_threads = True
-
     def __init__(self, handler: type[Handler], subject: Any, host: str, port: int) -> None:
         self.subject = subject
         super().__init__((host, port), handler)
@@ -52,10 +52,7 @@ class Server(ThreadingHTTPServer):
 def listen(handler: type[Handler], subject: Any, port: int = 0, host: str = LOOPBACK) -> Server:
     """Return a server, ready for ``serve_forever``; port 0 takes a free one.
 
-    Raises
-    ------
-    InputError
-        A port that is taken, or none; an address that is not this machine's.
+    :class:`InputError` for a port that is taken, or none, and for an address of another machine.
     """
     try:
         return Server(handler, subject, host, port)

@@ -27,18 +27,13 @@ from emulator.surrogates.protocol import ForwardMap
 
 NAME = "forward"
 _VERSION = 1.0
-_JSON = "application/json"
+_EVALUATIONS = ("Evaluate", "Gradient", "ApplyJacobian")
 
 
 class ForwardModel:
-    """A model of the UM-Bridge protocol: a forward map and its observations.
+    """A model of the UM-Bridge protocol: a forward map and its observations in one load state.
 
     Requests are answered one at a time.
-
-    Raises
-    ------
-    InputError
-        Observations of several load states.
     """
 
     def __init__(self, forward: ForwardMap, observe: Observation | Observations) -> None:
@@ -49,56 +44,53 @@ class ForwardModel:
         self._outputs = Outputs(forward, parts, what="serve")
         self._alone = threading.Lock()
         self.units = {name: part.unit for name, part in parts.items()}
+        self.output_sizes = [place.stop - place.start for place in self._outputs.places.values()]
 
-    @property
-    def input_sizes(self) -> list[int]:
-        """The number of parameters, of the one input."""
-        return [len(self.scene.parameters)]
-
-    @property
-    def output_sizes(self) -> list[int]:
-        """The number of values of each observation."""
-        return [place.stop - place.start for place in self._outputs.places.values()]
-
-    def evaluate(self, theta: np.ndarray) -> list[list[float]]:
-        """Return the observations at ``theta`` (p,)."""
+    def answer(self, what: str, request: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the answer to one request of the protocol."""
+        if request.get("name") != NAME:
+            raise _Fault(
+                "ModelNotFound", f"there is no model '{request.get('name')}', but '{NAME}'"
+            )
+        count, places = len(self.scene.parameters), list(self._outputs.places.values())
+        told: dict[str, dict[str, Any]] = {
+            "InputSizes": {"inputSizes": [count]},
+            "OutputSizes": {"outputSizes": self.output_sizes},
+            "ModelInfo": {"support": {**dict.fromkeys(_EVALUATIONS, True), "ApplyHessian": False}},
+            "TestShMem": {},  # memory that a client on this machine might share
+        }
+        if what in told:
+            return told[what]
+        if what not in _EVALUATIONS:
+            raise _Fault("UnsupportedFeature", f"{what}: not offered")
+        value = request["input"]
+        if not isinstance(value, list) or len(value) != 1:
+            raise _Fault("InvalidInput", "give one input: theta, as a list in a list")
+        theta = jnp.asarray(_vector(value[0], count, "theta"))[None]
+        if what == "Evaluate":
+            with self._alone:
+                values = _finite(self._outputs.values(theta)[0])
+            return {"output": [values[place].tolist() for place in places]}
+        output = _index(request, "outWrt", len(places))
+        _index(request, "inWrt", 1)
+        back = what == "Gradient"
+        name, size = ("sens", self.output_sizes[output]) if back else ("vec", count)
+        direction = _vector(request[name], size, name)
         with self._alone:
-            values = self._outputs.values(jnp.asarray(theta)[None])[0]
-        return [_finite(values[place]).tolist() for place in self._outputs.places.values()]
-
-    def gradient(self, output: int, theta: np.ndarray, weights: np.ndarray) -> list[float]:
-        """Return ``weights`` (m,) times the derivatives (m, p) of one observation."""
-        return (weights @ self._slopes(output, theta)).tolist()
-
-    def apply_jacobian(self, output: int, theta: np.ndarray, along: np.ndarray) -> list[float]:
-        """Return the derivative (m,) of one observation along a direction (p,) of theta."""
-        return (self._slopes(output, theta) @ along).tolist()
-
-    def _slopes(self, output: int, theta: np.ndarray) -> np.ndarray:
-        with self._alone:
-            values = self._outputs.slopes(jnp.asarray(theta)[None])[0]
-        return _finite(values[list(self._outputs.places.values())[output]])
+            slopes = _finite(self._outputs.slopes(theta)[0][places[output]])
+        return {"output": (direction @ slopes if back else slopes @ direction).tolist()}
 
 
 def serve(
-    forward: ForwardMap,
-    observe: Observation | Observations,
-    port: int = 4242,
-    host: str = LOOPBACK,
+    forward: ForwardMap, observe: Observation | Observations, port: int = 4242, host: str = LOOPBACK
 ) -> Server:
     """Return a UM-Bridge server of the model ``forward``, ready for ``serve_forever``.
 
     Parameters
     ----------
-    forward : the forward map.
-    observe : the observations that the server returns.
-    port : the port to listen on; 0 takes a free one.
+    observe : the observations that the server returns, of one load state.
+    port : the port to listen on, which no other program has; 0 takes a free one.
     host : the loopback address, or one that other machines reach, without a password.
-
-    Raises
-    ------
-    InputError
-        A port that is taken; observations of several load states.
     """
     return listen(_Handler, ForwardModel(forward, observe), port, host)
 
@@ -115,9 +107,9 @@ class _Handler(Handler):
     def do_GET(self) -> None:
         """Answer with the protocol's version and the model's name."""
         if self.is_foreign() or self.path != "/Info":
-            self.send(404, b"{}", _JSON)
+            self.send(404, {})
         else:
-            self._answer(200, {"protocolVersion": _VERSION, "models": [NAME]})
+            self.send(200, {"protocolVersion": _VERSION, "models": [NAME]})
 
     def do_POST(self) -> None:
         """Answer a request, or refuse it with the type of its error."""
@@ -125,7 +117,7 @@ class _Handler(Handler):
             request = json.loads(self.rfile.read(int(self.headers.get("Content-Length", 0))))
             if self.is_foreign() or not isinstance(request, dict):
                 raise ValueError("not a request of this protocol")
-            self._answer(200, answer(self.server.subject, self.path.removeprefix("/"), request))
+            self.send(200, self.server.subject.answer(self.path.removeprefix("/"), request))
         except _Fault as fault:
             self._refuse(fault.kind, str(fault))
         except (InputError, SolverError) as error:
@@ -134,44 +126,7 @@ class _Handler(Handler):
             self._refuse("InvalidInput", f"cannot read the request: {error}")
 
     def _refuse(self, kind: str, message: str) -> None:
-        self._answer(400, {"error": {"type": kind, "message": message}})
-
-    def _answer(self, code: int, content: Mapping[str, Any]) -> None:
-        self.send(code, json.dumps(content).encode(), _JSON)
-
-
-def answer(model: ForwardModel, what: str, request: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the answer to one request of the protocol."""
-    if request.get("name") != NAME:
-        raise _Fault("ModelNotFound", f"there is no model '{request.get('name')}', but '{NAME}'")
-    if what == "InputSizes":
-        return {"inputSizes": model.input_sizes}
-    if what == "OutputSizes":
-        return {"outputSizes": model.output_sizes}
-    if what == "ModelInfo":
-        support = {"Evaluate": True, "Gradient": True, "ApplyJacobian": True, "ApplyHessian": False}
-        return {"support": support}
-    if what == "TestShMem":  # memory that a client on this machine might share
-        return {}
-    if what == "Evaluate":
-        return {"output": model.evaluate(_theta(model, request))}
-    if what in ("Gradient", "ApplyJacobian"):
-        theta, sizes = _theta(model, request), model.output_sizes
-        output = _index(request, "outWrt", len(sizes))
-        _index(request, "inWrt", 1)
-        if what == "Gradient":
-            weights = _vector(request["sens"], sizes[output], "sens")
-            return {"output": model.gradient(output, theta, weights)}
-        direction = _vector(request["vec"], len(theta), "vec")
-        return {"output": model.apply_jacobian(output, theta, direction)}
-    raise _Fault("UnsupportedFeature", f"{what}: not offered")
-
-
-def _theta(model: ForwardModel, request: Mapping[str, Any]) -> np.ndarray:
-    value = request["input"]
-    if not isinstance(value, list) or len(value) != 1:
-        raise _Fault("InvalidInput", "give one input: theta, as a list in a list")
-    return _vector(value[0], model.input_sizes[0], "theta")
+        self.send(400, {"error": {"type": kind, "message": message}})
 
 
 def _vector(value: Any, size: int, name: str) -> np.ndarray:

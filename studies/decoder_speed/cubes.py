@@ -17,7 +17,7 @@ from studies.common.timing import Function, batched, clocked, loop, milliseconds
 import emulator as em
 from calibrate.measurements import Landmarks, landmarks, spread_landmarks
 from emulator.surrogates import Architecture, CachedEmulator, Emulator, augment
-from emulator.surrogates.network.part import Network, fresh
+from emulator.surrogates.network import Network, fresh
 from emulator.surrogates.taylor import expand
 from emulator.training.hybrid import mechanical_modes
 

@@ -27,18 +27,16 @@ from emulator.core.errors import InputError
 from emulator.core.progress import counting
 from emulator.scenes.scene import Scene
 from emulator.surrogates.emulator import Emulator
+from emulator.surrogates.network import standardised
 from emulator.surrogates.network.family import (
     FamilyModule,
     Learned,
     Standard,
-    build_family,
     on_body,
     physics_of,
 )
-from emulator.surrogates.network.graph import AugmentedGraph
-from emulator.surrogates.network.part import standardised
+from emulator.surrogates.network.graph import AugmentedGraph, BodyFeatures, describe
 from emulator.surrogates.network.pignn import Architecture
-from emulator.surrogates.network.ventricle_graph import BodyFeatures, describe
 from emulator.training.checkpoint import CHECKPOINT, Session, State
 from emulator.training.optimiser import clipped_adam, cosine, make_step, run
 from emulator.training.plan import Plan
@@ -154,7 +152,7 @@ def train_family(
         physics=physics_of(first),
         shapes=_ranges(described),
     )
-    module = build_family(architecture, learned.widths, plan.seed)
+    module = FamilyModule(architecture, learned.widths, plan.seed)
     definition, weights = nnx.split(module)
     optimiser = clipped_adam()
     descend = _descent(definition, scale, _gradient_scale(bodies), sizes.real)
@@ -204,8 +202,8 @@ def _check(runs: Sequence[BodyRuns]) -> str:
 
 def _standard(described: Sequence[BodyFeatures]) -> Standard:
     """Means and deviations of all features over all bodies."""
-    nodes = np.concatenate([body.nodes for body in described])
-    edges = np.concatenate([body.edges for body in described])
+    nodes = np.concatenate([body.graph.node_features for body in described])
+    edges = np.concatenate([body.graph.edge_features for body in described])
     edges = np.concatenate([edges, -edges * [1.0, 1.0, 1.0, -1.0]])  # either way round
     return Standard(nodes.mean(axis=0), _sd(nodes), edges.mean(axis=0), _sd(edges))
 
@@ -222,10 +220,11 @@ def _ranges(described: Sequence[BodyFeatures]) -> dict[str, tuple[float, float]]
 
 
 def _sizes(runs: Sequence[BodyRuns], described: Sequence[BodyFeatures]) -> _Sizes:
+    graphs = [body.graph for body in described]
     return _Sizes(
-        real=max(body.real for body in described),
-        virtual=max(len(body.nodes) - body.real for body in described) + 1,
-        edges=max(len(body.edges) for body in described),
+        real=max(graph.real for graph in graphs),
+        virtual=max(len(graph.node_features) - graph.real for graph in graphs) + 1,
+        edges=max(len(graph.senders) for graph in graphs),
         elements=max(len(each.scene.mesh.elements) for each in runs),
     )
 
@@ -238,21 +237,23 @@ def _padded(
     generator: np.random.Generator,
 ) -> _Body:
     """``runs`` and the network's features, padded. The last virtual node belongs to no body."""
-    scene, graph = runs.scene, standard.graph(body)
+    scene, told, graph = runs.scene, body.graph, standard.of(body.graph)
     size = body.shape["size"]
-    total, real = sizes.real + sizes.virtual, body.real
+    total, real = sizes.real + sizes.virtual, told.real
     features = np.zeros((total, graph.node_features.shape[1]), np.float32)
     features[:real] = graph.node_features[:real]
-    features[sizes.real : sizes.real + len(body.nodes) - real] = graph.node_features[real:]
-    place = np.where(np.arange(len(body.nodes)) < real, 0, sizes.real - real)
+    features[sizes.real : sizes.real + len(told.node_features) - real] = graph.node_features[real:]
+    place = np.where(np.arange(len(told.node_features)) < real, 0, sizes.real - real)
     ends = np.full((2, sizes.edges), total - 1, np.int32)
-    turned = generator.random(len(body.edges)) < 0.5
-    pair = np.stack([body.senders, body.receivers])
+    turned = generator.random(len(told.edge_features)) < 0.5
+    pair = np.stack([told.senders, told.receivers])
     pair = pair + place[pair]
-    ends[:, : len(body.edges)] = np.where(turned, pair[::-1], pair)
+    ends[:, : len(told.edge_features)] = np.where(turned, pair[::-1], pair)
     signs = np.where(turned[:, None], [-1.0, -1.0, -1.0, 1.0], 1.0)
     edges = np.zeros((sizes.edges, 4), np.float32)
-    edges[: len(body.edges)] = (signs * body.edges - standard.edge_mean) / standard.edge_sd
+    edges[: len(told.edge_features)] = (
+        signs * told.edge_features - standard.edge_mean
+    ) / standard.edge_sd
     grid = scene.discretisation
     weights = grid.weights.sum(axis=1)
     free = (~scene.held).astype(np.float32)
@@ -306,7 +307,7 @@ def _descent(
         nodes, edges, senders, receivers, *_ = cast(tuple[Any, ...], body)  # traced
         graph = AugmentedGraph(nodes, edges, senders, receivers, real)
         modes, mean = module.prepare(graph, body.vectors, body.shares)
-        coefficients = module.coefficients(standardised(body.position), mean)
+        coefficients = module.branch(standardised(body.position), mean)
         u = scale * jnp.tensordot(coefficients, modes, axes=1) * body.free
         wrong = u - body.u
         misfit = jnp.mean(jnp.sum(wrong**2, axis=-1) @ body.share) / (3.0 * scale**2)

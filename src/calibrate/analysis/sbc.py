@@ -34,7 +34,7 @@ from calibrate.statistical_model import Model
 from emulator.core.errors import InputError, check_seed
 from emulator.core.progress import counting
 from emulator.fem.campaign import executor, in_process
-from emulator.surrogates.protocol import solved_by
+from emulator.surrogates.fem import solved_by
 
 LOG_LIKELIHOOD = "log likelihood"
 """Name of the quantity that depends on the data."""

@@ -44,7 +44,8 @@ from calibrate.priors import Prior, bisect, bounds, box_prior, dependence_of
 from calibrate.statistical_model.prior_range import fit_to
 from emulator.core.errors import InputError, check_known, check_seed
 from emulator.fem.campaign import executor, in_process
-from emulator.surrogates.protocol import ForwardMap, solved_by
+from emulator.surrogates.fem import solved_by
+from emulator.surrogates.protocol import ForwardMap
 
 _EDGE = 1e-9  # cut off the unit interval, because unbounded priors have infinite quantiles at 0
 

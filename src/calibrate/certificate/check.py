@@ -36,7 +36,7 @@ from calibrate.certificate.predictive import Predictive
 from calibrate.certificate.runs import Runs, Solver, correction_from, descend
 from calibrate.certificate.verdict import Certificate, judge
 from calibrate.posterior import Posterior
-from calibrate.posterior.tree import make_tree
+from calibrate.posterior.posterior import make_tree
 from calibrate.samplers import SAMPLERS
 from calibrate.samplers.diagnostics import effective, normalised
 from calibrate.samplers.laplace import MISSED_AT, MISSED_BY

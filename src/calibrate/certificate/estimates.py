@@ -46,7 +46,7 @@ from calibrate.certificate.verdict import (
     Tail,
 )
 from calibrate.posterior import Posterior
-from calibrate.posterior.fit import Misfit, places_of
+from calibrate.posterior.diagnosis import Misfit, places_of
 from calibrate.samplers.diagnostics import effective, normalised, pareto_shape
 
 GROUPS = 25

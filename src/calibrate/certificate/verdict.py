@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from calibrate.posterior.fit import SMALLEST_P, Misfit
+from calibrate.posterior.diagnosis import SMALLEST_P, Misfit
 from calibrate.samplers.diagnostics import REFUSE_ABOVE_R_HAT, REFUSE_BELOW_ESS
 from emulator.core.representation import TableRepr
 

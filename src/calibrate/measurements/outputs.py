@@ -19,17 +19,14 @@ from calibrate.measurements import (
     parse_observation,
 )
 from emulator.accuracy.mesh_error import MeshError, MeshErrorEstimate
+from emulator.core.errors import InputError
 from emulator.scenes.scene import ENDOCARDIUM
-from emulator.surrogates.protocol import (
-    ForwardMap,
-    Prediction,
-    SolvingMap,
-    evaluator,
-    require_answers,
-)
+from emulator.surrogates.fem import FEMForward
+from emulator.surrogates.protocol import ForwardMap, Prediction
 
 FIELD = "field"
 """The name of the displacement's length at every node."""
+_AT_ONCE = 64  # theta in one batch
 
 
 class Outputs:
@@ -88,22 +85,33 @@ class Outputs:
 
         :class:`InputError` where the map has no answer at one of them.
         """
-        predicted = self._predict(thetas)
-        require_answers(self._map, predicted, self._what)
+        predicted = self._answered(self._predict(thetas))
         return np.asarray(self._values(predicted.displacement, thetas))
 
     def slopes(self, thetas: jax.Array) -> np.ndarray:
         """Return derivatives (n, m, p) at ``thetas`` (n, p); errors as of :meth:`values`."""
-        if not isinstance(self._map, SolvingMap):
-            require_answers(self._map, self._predict(thetas), self._what)
+        if not isinstance(self._map, FEMForward):
+            self._answered(self._predict(thetas))
             return np.asarray(self._derivatives(thetas))
         predicted, sensitivities = self._map.slopes_all(thetas)
-        require_answers(self._map, predicted, self._what)
+        self._answered(predicted)
         return np.asarray(self._derivatives_along(predicted.displacement, sensitivities, thetas))
+
+    def _answered(self, predicted: Prediction) -> Prediction:
+        """Return the predictions; :class:`InputError` where one is not valid."""
+        invalid = ~np.asarray(predicted.valid)
+        if invalid.any():
+            raise InputError(
+                f"{self._what}: {self._map.label} has no answer at {invalid.sum()} of "
+                f"{len(invalid)} theta"
+            )
+        return predicted
 
     @cached_property
     def _predict(self) -> Callable[[jax.Array], Prediction]:
-        return evaluator(self._map)
+        if isinstance(self._map, FEMForward):
+            return self._map.evaluate_all
+        return jax.jit(lambda t: jax.lax.map(self._map.evaluate, t, batch_size=_AT_ONCE))
 
     @cached_property
     def _values(self) -> Callable[[jax.Array, jax.Array], jax.Array]:

@@ -12,8 +12,8 @@ On the scale of the scene's parameter (:math:`x = \ln\theta` where it is logarit
     s_k \sim \text{HalfNormal}(\tfrac14 w_k)
 
 where :math:`F_k` is the normal distribution function of mean :math:`m_k` and sd :math:`s_k`, cut to
-the range (:mod:`calibrate.population.coordinates`): outside of it a forward map has no answer. So a
-member's density given the population is that of correlated normals, cut,
+the range: outside of it a forward map has no answer. So a member's density given the population is
+that of correlated normals, cut,
 
 .. math::
     p(x_i \mid m, s, R) = \frac{N(q_i; 0, R)}{\prod_k \phi(q_{ik})}
@@ -24,6 +24,16 @@ and where the population is far from both ends, :math:`x_i = m + \text{diag}(s) 
 form of :class:`calibrate.Population` (log-normals cut to the range, normal scores correlated), so
 that :math:`e^m` is the median, :math:`s` about the relative sd. The own unknowns of a member, which
 are all others, keep the prior of its model.
+
+A value x of a normal of mean m and sd s, cut to (l, h), has the normal score q,
+
+.. math:: x = m + s\,\Phi^{-1}\big(\Phi(a) + \Phi(q)\,[\Phi(b) - \Phi(a)]\big), \qquad
+          a = \frac{l - m}{s}, \quad b = \frac{h - m}{s}
+
+so that its distribution function at x is :math:`\Phi(q)`. Where both ends are many sd away,
+:math:`x = m + s q`. The map is smooth in m, s and q, and never leaves the interval. Its slope is
+
+.. math:: \frac{dx}{dq} = s\, \frac{\phi(q)}{\phi(t)}\, [\Phi(b) - \Phi(a)], \qquad t = (x - m) / s
 
 The LKJ distribution is that of Lewandowski, Kurowicka and Joe (2009): the density of R is
 proportional to :math:`\det(R)^{\eta - 1}`.
@@ -41,9 +51,10 @@ import jax
 import jax.numpy as jnp
 import numpyro
 import numpyro.distributions as dist
+from jax.scipy.special import ndtr, ndtri
+from jax.typing import ArrayLike
 from numpyro import handlers
 
-from calibrate.population.coordinates import from_score
 from calibrate.priors import log_normal, truncated, truncated_normal
 from calibrate.state_names import split
 from calibrate.statistical_model import Data, Model
@@ -52,6 +63,8 @@ from emulator.core.errors import InputError
 from emulator.scenes.parameter_space import Parameter
 
 MEDIAN, SD, CHOLESKY, SCORES = "median", "sd", "correlation_cholesky", "scores"
+_LEAST = 1e-300  # least mass at which ndtri is finite
+_FARTHEST = 30.0  # sd to which values farther from the mean are clipped
 
 
 def to_scale(parameter: Parameter, value: Any) -> Any:
@@ -69,6 +82,39 @@ def ends(parameter: Parameter) -> tuple[float, float]:
     if parameter.scale == "log":
         return math.log(parameter.low), math.log(parameter.high)
     return parameter.low, parameter.high
+
+
+def from_score(
+    score: jax.Array, mean: ArrayLike, sd: ArrayLike, low: ArrayLike, high: ArrayLike
+) -> jax.Array:
+    """Return the value in (``low``, ``high``) of a normal ``score``; all arguments broadcast.
+
+    ``mean`` lies between ``low`` and ``high``.
+    """
+    a, b = (low - jnp.asarray(mean)) / sd, (high - jnp.asarray(mean)) / sd
+    # Scores above 0 are counted from the upper end: 1 - 1e-17 is 1, 1e-17 is not 0.
+    upper = score > 0.0
+    q = jnp.where(upper, -score, score)
+    lower_end, upper_end = jnp.where(upper, -b, a), jnp.where(upper, -a, b)
+    mass = ndtr(lower_end) + ndtr(q) * (ndtr(upper_end) - ndtr(lower_end))
+    t = ndtri(jnp.maximum(mass, _LEAST))
+    # Round-off may leave the interval by its last digit.
+    return jnp.clip(mean + sd * jnp.where(upper, -t, t), low, high)
+
+
+def to_score(
+    value: jax.Array, mean: ArrayLike, sd: ArrayLike, low: ArrayLike, high: ArrayLike
+) -> tuple[jax.Array, jax.Array]:
+    """Return the normal score q of ``value``, the inverse of :func:`from_score`, and dx/dq."""
+    a, b = (low - jnp.asarray(mean)) / sd, (high - jnp.asarray(mean)) / sd
+    t = jnp.clip((value - jnp.asarray(mean)) / sd, -_FARTHEST, _FARTHEST)
+    upper = t > 0.0
+    lower_end, upper_end = jnp.where(upper, -b, a), jnp.where(upper, -a, b)
+    total_mass = ndtr(upper_end) - ndtr(lower_end)
+    mass = (ndtr(jnp.where(upper, -t, t)) - ndtr(lower_end)) / total_mass
+    q = ndtri(jnp.maximum(mass, _LEAST))
+    slope = jnp.asarray(sd) * total_mass * jnp.exp(0.5 * (t**2 - q**2))
+    return jnp.where(upper, -q, q), slope
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,10 +155,14 @@ class PopulationModel:
                 prior = model.given_earlier(name, model.sampled_priors[name], draws[member])
                 draws[member][name] = numpyro.sample(f"{name}[{member}]", prior)
         data = data or {}
-        for model, names in self._groups(data):
+        groups: dict[int, tuple[Model, list[str]]] = {}  # one program for each model
+        for member, model in self.members.items():
+            if member in data:
+                groups.setdefault(id(model), (model, []))[1].append(member)
+        for model, names in groups.values():
+            stacked = [_stacked([by[n] for n in names]) for by in (draws, data)]
             with handlers.block():
-                stacked = [draws[n] for n in names], [data[n] for n in names]
-                log_likelihoods = _log_likelihoods(model, *stacked)
+                log_likelihoods = jax.vmap(model.map_log_likelihood)(*stacked)
             numpyro.factor(f"data of {', '.join(names)}", jnp.sum(log_likelihoods))
 
     @cached_property
@@ -141,22 +191,9 @@ class PopulationModel:
             values[name] = from_scale(parameter, x)
         return values
 
-    def _groups(self, data: Mapping[str, Any]) -> list[tuple[Model, list[str]]]:
-        """Return members with data, grouped by their model: one program for each group."""
-        groups: dict[int, tuple[Model, list[str]]] = {}
-        for member, model in self.members.items():
-            if member in data:
-                groups.setdefault(id(model), (model, []))[1].append(member)
-        return list(groups.values())
 
-
-def _log_likelihoods(
-    model: Model, draws: list[dict[str, jax.Array]], data: list[Data]
-) -> jax.Array:
-    """Return the log density of each member's data, (members,)."""
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *draws)
-    values = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(dict, data))
-    return jax.vmap(model.map_log_likelihood)(stacked, values)
+def _stacked(members: Sequence[Mapping[str, Any]]) -> Any:
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(dict, members))
 
 
 def population_model(
@@ -188,42 +225,36 @@ def population_model(
         raise InputError("hierarchy: no members; give a model and data by member's name")
     names = _shared_names(members, shared)
     parameters = {name: _common_parameter(members, name) for name in names}
-    _check_own(members, names)
+    for member, each in members.items():
+        tied = () if each.dependence is None else each.dependence.names
+        if len({name in names for name in tied}) > 1:
+            raise InputError(
+                f"hierarchy: the prior of member '{member}' correlates {', '.join(tied)}, of which "
+                "only some follow the population"
+            )
     if not eta > 0.0:
         raise InputError(f"hierarchy: eta is {eta}; it must be above 0")
     for role, priors in (("median", median), ("spread", spread)):
         for name in priors or {}:
             if name not in names:
                 raise InputError(f"hierarchy: {role} of '{name}'; shared: {', '.join(names)}")
-    scene = next(iter(members.values())).forward.scene
-    medians = {n: (median or {}).get(n, _median_prior(p)) for n, p in parameters.items()}
-    spreads = {n: _spread_prior(n, p, (spread or {}).get(n)) for n, p in parameters.items()}
-    return PopulationModel(
-        dict(members), parameters, truncated(medians, scene), spreads, float(eta)
-    )
-
-
-def _median_prior(parameter: Parameter) -> dist.Distribution:
-    """Return a normal on the scale: mean in the middle of the range, sd half its width."""
-    low, high = ends(parameter)
-    middle, half = 0.5 * (low + high), 0.5 * (high - low)
-    kind = log_normal if parameter.scale == "log" else truncated_normal
-    return kind(from_scale(parameter, middle), half, parameter.low, parameter.high)
-
-
-def _spread_prior(
-    name: str, parameter: Parameter, spread: dist.Distribution | float | None
-) -> dist.Distribution:
-    if spread is None:
+    medians: dict[str, dist.Distribution] = {}
+    spreads: dict[str, dist.Distribution] = {}
+    for name, parameter in parameters.items():
         low, high = ends(parameter)
-        spread = 0.25 * (high - low)
-    if isinstance(spread, dist.Distribution):
-        return spread
-    if not 0.0 < spread < float("inf"):
-        raise InputError(
-            f"hierarchy: spread of '{name}' is {spread}; give a number above 0, or a distribution"
-        )
-    return dist.HalfNormal(spread)
+        middle, half = from_scale(parameter, 0.5 * (low + high)), 0.5 * (high - low)
+        kind = log_normal if parameter.scale == "log" else truncated_normal
+        usual = kind(middle, half, parameter.low, parameter.high)
+        medians[name] = (median or {}).get(name, usual)
+        given = (spread or {}).get(name, 0.5 * half)
+        if not (isinstance(given, dist.Distribution) or 0.0 < given < math.inf):
+            raise InputError(
+                f"hierarchy: spread of '{name}' is {given}; give a number above 0, or a "
+                "distribution"
+            )
+        spreads[name] = given if isinstance(given, dist.Distribution) else dist.HalfNormal(given)
+    cut = truncated(medians, next(iter(members.values())).forward.scene)
+    return PopulationModel(dict(members), parameters, cut, spreads, float(eta))
 
 
 def _shared_names(members: Mapping[str, Model], names: Sequence[str] | None) -> tuple[str, ...]:
@@ -254,10 +285,9 @@ def _shared_names(members: Mapping[str, Model], names: Sequence[str] | None) -> 
 
 def _common_parameter(members: Mapping[str, Model], name: str) -> Parameter:
     """Return the parameter of the unknown ``name``, which has to be the same for every member."""
-    parameters: dict[str, Parameter] = {}
-    for member, model in members.items():
-        scene = model.forward.scene
-        parameters[member] = scene.parameters[scene.parameter_names.index(split(name)[0])]
+    scenes = {member: model.forward.scene for member, model in members.items()}
+    base = split(name)[0]
+    parameters = {m: s.parameters[s.parameter_names.index(base)] for m, s in scenes.items()}
     (first, parameter), *others = parameters.items()
     for member, other in others:
         if other != parameter:
@@ -266,17 +296,6 @@ def _common_parameter(members: Mapping[str, Model], name: str) -> Parameter:
                 f"{_in_words(other)} for '{member}': a population has one range and one scale"
             )
     return parameter
-
-
-def _check_own(members: Mapping[str, Model], shared: Sequence[str]) -> None:
-    """Raise an :class:`InputError` where a prior ties own unknowns of a member to shared ones."""
-    for member, model in members.items():
-        tied = () if model.dependence is None else model.dependence.names
-        if len({name in shared for name in tied}) > 1:
-            raise InputError(
-                f"hierarchy: the prior of member '{member}' correlates {', '.join(tied)}, of which "
-                "only some follow the population"
-            )
 
 
 def _in_words(parameter: Parameter) -> str:

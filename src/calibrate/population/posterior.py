@@ -26,6 +26,7 @@ from emulator.core.store import write_netcdf
 ALONE, NEW, CORRELATION = "alone", "new_member", "correlation"
 PARAMETER, MEMBER = "parameter", "member"
 _OTHER = "other_parameter"
+_ALONE_DRAWS = 1000  # kept of each member by itself
 
 
 class Shrinkage(NamedTuple):
@@ -111,12 +112,8 @@ class Hierarchy(TableRepr):
     def predict(self, model: Model, *, seed: int = 0) -> dict[str, np.ndarray]:
         """Return data of a member not seen, noise included: ``(s, *shape)`` by observation.
 
-        There are about 500 draws. Own unknowns of ``model`` are drawn from its prior.
-
-        Raises
-        ------
-        InputError
-            ``model`` does not infer a shared unknown.
+        There are about 500 draws. Own unknowns of ``model`` are drawn from its prior; a model that
+        does not infer a shared unknown is refused.
         """
         for name in self.shared:
             if name not in model.states.unknowns:
@@ -125,11 +122,8 @@ class Hierarchy(TableRepr):
         shape = some[self.shared[0]].shape
         prior_key, data_key = jax.random.split(jax.random.key(seed))
         draws = {name: jnp.asarray(values) for name, values in some.items()}
-        for key, (name, prior) in zip(
-            jax.random.split(prior_key, len(model.sampled_priors)),
-            model.sampled_priors.items(),
-            strict=True,
-        ):
+        keys = jax.random.split(prior_key, len(model.sampled_priors))
+        for key, (name, prior) in zip(keys, model.sampled_priors.items(), strict=True):
             if name not in self.shared:
                 draws[name] = model.given_earlier(name, prior, draws).sample(key, shape)
         data = predictions.replicates(model, draws, data_key)
@@ -138,12 +132,8 @@ class Hierarchy(TableRepr):
     def as_prior(self, source: str = "") -> Population:
         """Return the population as a prior: log-normals fitted to :meth:`new_member`.
 
-        The uncertainty of the population widens it.
-
-        Raises
-        ------
-        InputError
-            A parameter that takes values of 0 or less.
+        The uncertainty of the population widens it. A parameter with values of 0 or less is
+        refused.
         """
         source = source or f"a hierarchy of {len(self.members)} members"
         return population_of_fits({n: v.tolist() for n, v in self.new_member().items()}, source)
@@ -151,12 +141,13 @@ class Hierarchy(TableRepr):
     def shrinkage(self) -> dict[str, dict[str, Shrinkage]]:
         """Return mean and sd alone and in the population, by shared unknown and member."""
         table: dict[str, dict[str, Shrinkage]] = {name: {} for name in self.shared}
-        for name in self.shared:
+        for name, rows in table.items():
+            alone, together = (np.asarray(self.tree[g][name]) for g in (ALONE, "posterior"))
             for i, member in enumerate(self.members):
-                alone = np.asarray(self.tree[ALONE][name])[i]
-                together = np.asarray(self.tree["posterior"][name])[..., i]
-                numbers = (alone.mean(), alone.std(ddof=1), together.mean(), together.std(ddof=1))
-                table[name][member] = Shrinkage(*map(float, numbers))
+                both = (alone[i], together[..., i])
+                rows[member] = Shrinkage(
+                    *(float(f) for d in both for f in (d.mean(), d.std(ddof=1)))
+                )
         return table
 
     def summary(self, probability: float = 0.9) -> dict[str, dict[str, float]]:
@@ -166,7 +157,7 @@ class Hierarchy(TableRepr):
     def warnings(self) -> list[str]:
         """Return a sentence for each fault of the run, with what to do; empty if there is none."""
         statistics = {str(n): v.values for n, v in self.tree["sample_stats"].data_vars.items()}
-        return diagnose(self.draws(), statistics, self.summary(), {})
+        return [*diagnose(self.draws(), statistics, self.summary(), {})]
 
     def save(self, path: str | Path) -> None:
         """Write the DataTree as netCDF, whole or not at all."""
@@ -224,15 +215,12 @@ def make_tree(
     return tree
 
 
-def tree_of_alone(draws: Mapping[str, Mapping[str, np.ndarray]], count: int = 1000) -> xr.DataTree:
-    """Return the group ``alone``: ``count`` draws of each member, evenly spaced."""
-    first = next(iter(draws.values()))
+def tree_of_alone(draws: Mapping[str, Mapping[str, np.ndarray]]) -> xr.DataTree:
+    """Return the group ``alone``: draws of each member, evenly spaced."""
 
     def spaced(values: np.ndarray) -> np.ndarray:
-        return values[np.linspace(0, len(values) - 1, count).astype(int)]
+        return values[np.linspace(0, len(values) - 1, _ALONE_DRAWS).astype(int)]
 
-    variables = {
-        name: ((MEMBER, "draw"), np.stack([spaced(by[name]) for by in draws.values()]))
-        for name in first
-    }
+    names, members = next(iter(draws.values())), draws.values()
+    variables = {n: ((MEMBER, "draw"), np.stack([spaced(by[n]) for by in members])) for n in names}
     return xr.DataTree(xr.Dataset(variables, coords={MEMBER: list(draws)}))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -10,10 +10,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpyro.distributions as dist
 
-from calibrate.population.coordinates import Information, information_of
-from calibrate.population.density import Conditions, density_of_population
+from calibrate.population.density import (
+    Conditions,
+    Information,
+    density_of_population,
+    information_of,
+)
 from calibrate.population.model import PopulationModel, population_model, to_scale
 from calibrate.population.posterior import ALONE, Hierarchy, make_tree, tree_of_alone
 from calibrate.posterior import sample
@@ -41,30 +44,23 @@ Members = Mapping[str, tuple[Model, Any]]
 def hierarchy(
     members: Members,
     *,
-    shared: Sequence[str] | None = None,
-    median: Mapping[str, dist.Distribution] | None = None,
-    spread: Mapping[str, dist.Distribution | float] | None = None,
-    eta: float = 2.0,
     options: NUTSOptions | None = None,
     alone: str = "nuts",
     seed: int = 0,
     progress: bool = False,
+    **population: Any,
 ) -> Hierarchy:
     """Calibrate the members of a population together (:mod:`calibrate.population.model`).
 
     Parameters
     ----------
     members : the ``(model, data)`` of each member, by name; data is ``None`` without measurements.
-    shared : the unknowns that follow the population; by default all that every member has and that
-        are no parameters of its loads.
-    median : the prior of the population's median, by shared name, in the parameter's unit.
-    spread : the prior of the population's sd, of the logarithm where the scene's scale is
-        logarithmic; a number is the scale of a half-normal.
-    eta : the parameter of the prior of correlations; 1 is uniform, more prefers none.
     options : the options of NUTS for all members together; by default its own, with target_accept
         0.98.
     alone : the sampler of each member alone, for comparison and for good coordinates; ``laplace``
         is cheap and as good for the latter.
+    population : ``shared``, ``median``, ``spread`` and ``eta`` of
+        :func:`~calibrate.population.population_model`.
 
     Raises
     ------
@@ -75,13 +71,7 @@ def hierarchy(
     checked = {
         m: (model, None) if y is None else model.given(y) for m, (model, y) in members.items()
     }
-    model = population_model(
-        {member: model for member, (model, _) in checked.items()},
-        shared=shared,
-        median=median,
-        spread=spread,
-        eta=eta,
-    )
+    model = population_model({m: model for m, (model, _) in checked.items()}, **population)
     data = {member: dict(y) for member, (_, y) in checked.items() if y is not None}
     return sample_population(
         model, data, options=options, alone=alone, seed=seed, progress=progress
@@ -152,9 +142,7 @@ def _alone(
 
 
 def _information(
-    model: PopulationModel,
-    alone: Mapping[str, Mapping[str, np.ndarray]],
-    data: Mapping[str, Data],
+    model: PopulationModel, alone: Mapping[str, Mapping[str, np.ndarray]], data: Mapping[str, Data]
 ) -> Information:
     """Return the information of each member's data, from its posterior alone and its prior."""
     rows, priors = [], {}

@@ -30,7 +30,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -108,16 +107,11 @@ class Comparison:
 def compare(trees: Mapping[str, xr.DataTree]) -> Comparison:
     """Compare posteriors of the same data, as :class:`~calibrate.posterior.Posterior` keeps them.
 
-    Raises
-    ------
-    InputError
-        Fewer than two, posteriors of different data, or without log likelihoods.
+    :class:`InputError` for fewer than two, for different data, or without log likelihoods.
     """
     if len(trees) < 2:
         raise InputError(f"compare: {len(trees)} posterior is given; give two or more")
-    first, *others = trees
-    for name in others:
-        _check_same_data((first, trees[first]), (name, trees[name]))
+    _check_same_data(trees)
     scores = {}
     with warnings.catch_warnings():
         # ArviZ's own warning of influential data; they are counted below.
@@ -127,44 +121,34 @@ def compare(trees: Mapping[str, xr.DataTree]) -> Comparison:
         table = stats.compare(scores, round_to="none")
     models = []
     for name, row in table.iterrows():
-        score, attributes = scores[name], trees[name].attrs
-        models.append(
-            Compared(
-                name=str(name),
-                elpd=float(score.elpd),
-                se=float(score.se),
-                difference=float(row["elpd_diff"]),
-                difference_se=float(row["dse"]),
-                weight=float(row["weight"]),
-                parameters=float(score.p),
-                unreliable=int(np.sum(np.asarray(score.pareto_k) > score.good_k)),
-                log_evidence=_number(attributes.get("log_evidence")),
-                log_evidence_error=_number(attributes.get("log_evidence_error")),
-            )
-        )
-    return Comparison(tuple(models), int(scores[first].n_data_points))
+        score = scores[name]
+        numbers = (score.elpd, score.se, row["elpd_diff"], row["dse"], row["weight"], score.p)
+        elpd, se, gap, gap_se, weight, count = map(float, numbers)
+        unreliable = int(np.sum(np.asarray(score.pareto_k) > score.good_k))
+        evidence = (trees[name].attrs.get(key) for key in ("log_evidence", "log_evidence_error"))
+        known = (None if number is None else float(number) for number in evidence)
+        models.append(Compared(str(name), elpd, se, gap, gap_se, weight, count, unreliable, *known))
+    return Comparison(tuple(models), int(scores[next(iter(trees))].n_data_points))
 
 
-def _check_same_data(first: tuple[str, xr.DataTree], other: tuple[str, xr.DataTree]) -> None:
+def _check_same_data(trees: Mapping[str, xr.DataTree]) -> None:
     """Refuse posteriors that were not conditioned on the same numbers."""
-    (one, a), (two, b) = ((name, _observed(name, tree)) for name, tree in (first, other))
-    if set(a) != set(b):
-        raise InputError(
-            f"{one} observes {', '.join(sorted(a))}, {two} {', '.join(sorted(b))}; "
-            "only models of the same data can be compared"
-        )
-    for name, values in a.items():
-        if values.shape != b[name].shape or not np.array_equal(values, b[name]):
+    for name, tree in trees.items():
+        if "observed_data" not in tree:
+            raise InputError(f"{name} has no observed data")
+    (one, a), *others = ((name, tree["observed_data"].data_vars) for name, tree in trees.items())
+    for two, b in others:
+        if set(a) != set(b):
             raise InputError(
-                f"{one} and {two} were given different data of '{name}'; only models of the same "
-                "data can be compared"
+                f"{one} observes {', '.join(sorted(map(str, a)))}, {two} "
+                f"{', '.join(sorted(map(str, b)))}; only models of the same data can be compared"
             )
-
-
-def _observed(name: str, tree: xr.DataTree) -> dict[str, np.ndarray]:
-    if "observed_data" not in tree:
-        raise InputError(f"{name} has no observed data")
-    return {str(n): np.asarray(v) for n, v in tree["observed_data"].data_vars.items()}
+        for observed, values in a.items():
+            if not np.array_equal(values, b[observed]):
+                raise InputError(
+                    f"{one} and {two} were given different data of '{observed}'; only models of "
+                    "the same data can be compared"
+                )
 
 
 def _all_data(name: str, tree: xr.DataTree) -> xr.DataTree:
@@ -184,7 +168,3 @@ def _all_data(name: str, tree: xr.DataTree) -> xr.DataTree:
     return xr.DataTree.from_dict(
         {"log_likelihood": joined, "posterior": tree["posterior"].to_dataset()}
     )
-
-
-def _number(value: Any) -> float | None:
-    return None if value is None else float(value)

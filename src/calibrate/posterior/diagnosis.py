@@ -1,16 +1,42 @@
-"""The draws of each parameter in a few numbers, and what is wrong with a run, in words."""
+r"""The draws in a few numbers, and what is wrong with a run or with its data, in words.
+
+Whether data could have come from the model is told by data simulated from draws of the posterior.
+Distances of simulated and measured data from a prediction say how much of the one is as far off as
+the other: posterior predictive p-values :math:`P(T(y^\text{rep}) \ge T(y))` (Gelman, Meng and Stern
+1996) of the data as a whole, :math:`T_1`, and of its worst datum, :math:`T_2`. From the replicates
+that a posterior keeps, with mean :math:`m_j` and sd :math:`s_j` of each datum,
+
+.. math:: T_1(y) = \sum_j (y_j - m_j)^2 / s_j^2, \qquad T_2(y) = \max_j |y_j - m_j| / s_j
+
+This costs no evaluation and trusts the forward map; a certificate's check
+(:mod:`calibrate.certificate.estimates`) trusts FEM, and knows theta.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import compress
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
 from calibrate.arviz import base, stats
 from calibrate.samplers import r_hat
 from calibrate.samplers.diagnostics import ENOUGH_ESS, WARN_ABOVE_R_HAT
 from calibrate.samplers.laplace import MISSED_AT, MISSED_BY
+
+SMALLEST_P = 0.005
+OUTLYING = 4.0  # sds, beyond which 0.6 % of sets of 100 Gaussian data have a datum
+_FEWEST = 200  # replicates from which such a small p can be estimated
+_LARGEST_K = 0.7  # Vehtari et al. (2024)
+_LOWEST_EFFICIENCY = 0.2
+_LOWEST_ACCEPTANCE = 0.1
+_MANY = 100.0
+_MARKED = 0.5  # standard deviations from which a shift of divergences is reported
+_NAMED = 3  # largest number of parameters that a sentence names
 
 
 def summary_of(
@@ -37,21 +63,13 @@ def summary_of(
     return table
 
 
-_LARGEST_K = 0.7  # Vehtari et al. (2024)
-_LOWEST_EFFICIENCY = 0.2
-_LOWEST_ACCEPTANCE = 0.1
-_MANY = 100.0
-_MARKED = 0.5  # standard deviations from which a shift of divergences is reported
-_NAMED = 3  # largest number of parameters that a sentence names
-
-
 def diagnose(
     draws: Mapping[str, np.ndarray],
     statistics: Mapping[str, np.ndarray],
     summary: Mapping[str, Mapping[str, float]],
     attributes: Mapping[str, Any],
-) -> list[str]:
-    """Return a sentence for each thing that is wrong, with what to do; empty if nothing is.
+) -> Iterator[str]:
+    """Yield a sentence for each thing that is wrong, with what to do; nothing if nothing is.
 
     Parameters
     ----------
@@ -59,31 +77,54 @@ def diagnose(
     summary : the summary of each parameter, with ``r_hat``, ``ess_bulk`` and ``ess_tail``.
     attributes : the attributes of the run, e.g. ``pareto_k``.
     """
-    sentences = [
-        _divergences(draws, statistics.get("diverging")),
-        _disagreement(summary),
-        _too_few(summary),
-        _rejections(statistics.get("accepted")),
-        _approximation(attributes.get("pareto_k"), attributes.get("importance_efficiency")),
-        _missed(attributes.get(MISSED_AT), attributes.get(MISSED_BY)),
-    ]
-    return [sentence for sentence in sentences if sentence]
-
-
-def _divergences(draws: Mapping[str, np.ndarray], diverging: np.ndarray | None) -> str:
-    if diverging is None or not np.any(diverging):
-        return ""
-    diverging = np.asarray(diverging, bool)
-    count, share = int(diverging.sum()), 100.0 * diverging.mean()
-    clusters = [place for name, v in draws.items() if (place := _where(name, v, diverging))]
-    places = [words for _, words in sorted(clusters, reverse=True)[:_NAMED]]
-    return (
-        f"{count} divergent transitions of {diverging.size} ({share:.2g} %)"
-        + (f", mostly at {' and '.join(places)}" if places else ", spread over the whole posterior")
-        + ": the posterior is too sharp or too curved there for the step size, and its part beyond "
-        "may be missing. Raise target_accept towards 1, give more warm-up, or use a prior that "
-        "leaves out what cannot be"
-    )
+    if np.any(diverging := np.asarray(statistics.get("diverging", False), bool)):
+        count, share = int(diverging.sum()), 100.0 * diverging.mean()
+        clusters = [place for name, v in draws.items() if (place := _where(name, v, diverging))]
+        places = " and ".join(words for _, words in sorted(clusters, reverse=True)[:_NAMED])
+        yield (
+            f"{count} divergent transitions of {diverging.size} ({share:.2g} %), "
+            f"{f'mostly at {places}' if places else 'spread over the whole posterior'}: the "
+            "posterior is too sharp or too curved there for the step size, and its part beyond may "
+            "be missing. Raise target_accept towards 1, give more warm-up, or use a prior that "
+            "leaves out what cannot be"
+        )
+    r_hats = {name: row["r_hat"] for name, row in summary.items()}
+    name = max(r_hats, key=lambda n: np.nan_to_num(r_hats[n], nan=np.inf))
+    if not np.isfinite(r_hats[name]):
+        yield f"R-hat of {name} is not a number: too few draws, or draws that do not vary"
+    elif r_hats[name] > WARN_ABOVE_R_HAT:
+        yield (
+            f"the chains disagree about {name}, R-hat {r_hats[name]:.3f}: run longer; if it stays, "
+            "there are several modes or a long ridge, for which sampler smc is made"
+        )
+    sizes = {n: min(row["ess_bulk"], row["ess_tail"]) for n, row in summary.items()}
+    name = min(sizes, key=lambda n: sizes[n])
+    if not sizes[name] >= ENOUGH_ESS:
+        yield (
+            f"{sizes[name]:.0f} effective draws of {name}, fewer than {ENOUGH_ESS:.0f}: quantiles "
+            "are uncertain; take more draws"
+        )
+    if (rate := float(np.mean(statistics.get("accepted", 1.0)))) < _LOWEST_ACCEPTANCE:
+        yield (
+            f"FEM took {100.0 * rate:.2g} % of the proposals only: the forward map is far from FEM "
+            "here; train it longer, or use forward map 'corrected'"
+        )
+    k, efficiency = attributes.get("pareto_k", 0.0), attributes.get("importance_efficiency", 1.0)
+    if not (k <= _LARGEST_K and efficiency >= _LOWEST_EFFICIENCY):
+        yield (
+            f"the Gaussian approximation is poor, Pareto k {k:.2f} (at most {_LARGEST_K}) and "
+            f"{100.0 * efficiency:.2g} % of the draws effective (at least "
+            f"{100.0 * _LOWEST_EFFICIENCY:.0f} %): use a sampler, such as nuts"
+        )
+    place, lighter = attributes.get(MISSED_AT), attributes.get(MISSED_BY)
+    if place is not None and lighter is not None:
+        times = float(np.exp(min(-lighter, np.log(_MANY))))
+        mass = "many times" if times >= _MANY else f"{times:.2g} times"
+        yield (
+            f"no draw is at another mode of the posterior, {place}, which has {mass} the mass of "
+            "all draws: use a sampler for several modes, such as smc, or a prior that leaves one "
+            "of them out"
+        )
 
 
 def _where(name: str, values: np.ndarray, diverging: np.ndarray) -> tuple[float, str] | None:
@@ -96,62 +137,78 @@ def _where(name: str, values: np.ndarray, diverging: np.ndarray) -> tuple[float,
     return abs(shift), f"{'low' if shift < 0 else 'high'} {name} ({low:.4g} to {high:.4g})"
 
 
-def _disagreement(summary: Mapping[str, Mapping[str, float]]) -> str:
-    name = max(summary, key=lambda n: _worse(summary[n]["r_hat"]))
-    worst = summary[name]["r_hat"]
-    if worst <= WARN_ABOVE_R_HAT:
-        return ""
-    if not np.isfinite(worst):
-        return f"R-hat of {name} is not a number: too few draws, or draws that do not vary"
-    return (
-        f"the chains disagree about {name}, R-hat {worst:.3f}: run longer; if it stays, there are "
-        "several modes or a long ridge, for which sampler smc is made"
-    )
+@dataclass(frozen=True)
+class Misfit:
+    """Discrepancies of one observation.
+
+    p, p_worst : the posterior predictive p of the whole (T_1) and of its worst datum (T_2).
+    outlying : the data beyond 4 sd, each with its mean distance in sd, the farthest first.
+    """
+
+    p: float
+    p_worst: float
+    outlying: dict[str, float]
+
+    @classmethod
+    def of(
+        cls, places: list[str], whole: np.ndarray, simulated: np.ndarray, distance: np.ndarray
+    ) -> Misfit:
+        """Return the misfit of one observation from s draws.
+
+        places : the names of the data (n,).
+        whole : whether the data simulated at each draw is as unlikely as the measured, (s,).
+        simulated : the distance of simulated data from its prediction, (s, n).
+        distance : the distance of measured data from its prediction, (s, n) or (1, n).
+        """
+        # The sd is estimated from simulated data, because some distributions give none.
+        sd = np.sqrt(np.mean(simulated**2, axis=0))
+        simulated, distance = simulated / sd, distance / sd
+        mean = distance.mean(axis=0)
+        return cls(
+            float(whole.mean()),
+            float(np.mean(simulated.max(axis=1) >= distance.max(axis=1))),
+            {places[k]: float(mean[k]) for k in np.argsort(-mean) if mean[k] > OUTLYING},
+        )
 
 
-def _worse(r_hat: float) -> float:
-    return r_hat if np.isfinite(r_hat) else np.inf
+def places_of(name: str, shape: tuple[int, ...]) -> list[str]:
+    """Return names of an observation's data: ``displacement[1, 2]``, or ``volume`` for one."""
+    if math.prod(shape) == 1:
+        return [name]
+    return [f"{name}[{', '.join(map(str, k))}]" for k in np.ndindex(shape)]
 
 
-def _too_few(summary: Mapping[str, Mapping[str, float]]) -> str:
-    sizes = {n: min(row["ess_bulk"], row["ess_tail"]) for n, row in summary.items()}
-    name = min(sizes, key=lambda n: sizes[n])
-    if sizes[name] >= ENOUGH_ESS:
-        return ""
-    return (
-        f"{sizes[name]:.0f} effective draws of {name}, fewer than {ENOUGH_ESS:.0f}: quantiles "
-        "are uncertain; take more draws"
-    )
+def misfits(tree: xr.DataTree) -> list[str]:
+    """Return a sentence for each observation that does not fit; none without replicated data."""
+    if "posterior_predictive" not in tree.children:
+        return []
+    sentences = []
+    simulated = tree["posterior_predictive"].to_dataset()
+    for name, data in tree["observed_data"].data_vars.items():
+        replicates = simulated[name].values
+        y = replicates.reshape(-1, data.size)
+        if len(y) < _FEWEST or not np.isfinite(y).all() or not (y.std(axis=0) > 0.0).all():
+            continue
+        misfit = misfit_of(str(name), replicates, data.values)
+        if misfit.p >= SMALLEST_P and misfit.p_worst > 0.0:
+            continue
+        worst = [f" ({place} is {d:.3g} sd off)" for place, d in misfit.outlying.items()]
+        sentences.append(
+            f"{name} does not fit the model, posterior predictive p "
+            f"{min(misfit.p, misfit.p_worst):.3f}{''.join(worst[:1])}: check outlying data, "
+            "registration, units, law and noise sd"
+        )
+    return sentences
 
 
-def _rejections(accepted: np.ndarray | None) -> str:
-    if accepted is None or (rate := float(np.mean(accepted))) >= _LOWEST_ACCEPTANCE:
-        return ""
-    return (
-        f"FEM took {100.0 * rate:.2g} % of the proposals only: the forward map is far from FEM "
-        "here; train it longer, or use forward map 'corrected'"
-    )
+def misfit_of(name: str, replicates: np.ndarray, data: np.ndarray) -> Misfit:
+    """Return the misfit of data (*shape) to its replicates (chains, draws, *shape).
 
-
-def _approximation(pareto_k: float | None, efficiency: float | None) -> str:
-    if pareto_k is None or efficiency is None:
-        return ""
-    if pareto_k <= _LARGEST_K and efficiency >= _LOWEST_EFFICIENCY:
-        return ""
-    return (
-        f"the Gaussian approximation is poor, Pareto k {pareto_k:.2f} (at most {_LARGEST_K}) and "
-        f"{100.0 * efficiency:.2g} % of the draws effective (at least "
-        f"{100.0 * _LOWEST_EFFICIENCY:.0f} %): use a sampler, such as nuts"
-    )
-
-
-def _missed(place: str | None, lighter: float | None) -> str:
-    if place is None or lighter is None:
-        return ""
-    times = float(np.exp(min(-lighter, np.log(_MANY))))
-    mass = "many times" if times >= _MANY else f"{times:.2g} times"
-    return (
-        f"no draw is at another mode of the posterior, {place}, which has {mass} the mass of all "
-        "draws: use a sampler for several modes, such as smc, or a prior that leaves one of them "
-        "out"
-    )
+    Missing data is left out.
+    """
+    present = np.isfinite(data).ravel()
+    y = replicates.reshape(-1, data.size)[:, present]
+    simulated, distance = np.abs(y - y.mean(axis=0)), np.abs(data.ravel()[present] - y.mean(axis=0))
+    sums = [((x / y.std(axis=0)) ** 2).sum(axis=-1) for x in (simulated, distance)]
+    places = list(compress(places_of(name, data.shape), present))
+    return Misfit.of(places, sums[0] >= sums[1], simulated, distance[None])

@@ -30,9 +30,9 @@ DRAWS = 200
 class KlotzBand(NamedTuple):
     """Curves of a prior against Klotz's relation.
 
-    apart : (s,) kPa, the largest difference of pressure at each draw.
-    band : kPa, its half-width.
-    left_out : draws at which the forward map has no answer.
+    apart : the largest difference of pressure at each draw, (s,) kPa.
+    band : the half-width of the band, kPa.
+    left_out : the number of draws at which the forward map has no answer.
     """
 
     apart: np.ndarray
@@ -87,17 +87,12 @@ def klotz_band(
         through = Klotz(volumes[-1], pressures[-1]) if point is None else point
         return jnp.max(jnp.abs(through.pressure(volumes) - pressures))
 
-    row = _row(model.states.states, state)
+    if state is not None:
+        check_known(state, model.states.states, "klotz: load state")
+    row = -1 if state is None else model.states.states.index(state)
     thetas = model.states.thetas(model.prior_draws(jax.random.key(seed), count))[:, row]
     curves = np.asarray(jax.jit(partial(jax.lax.map, apart))(thetas))
     valid = curves[np.isfinite(curves)]
     if not valid.size:
         raise InputError(f"klotz: the forward map has no answer at any of {count} draws")
     return KlotzBand(valid, band, count - valid.size)
-
-
-def _row(states: tuple[str, ...], state: str | None) -> int:
-    if state is None:
-        return -1
-    check_known(state, states, "klotz: load state")
-    return states.index(state)

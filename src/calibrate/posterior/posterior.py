@@ -1,4 +1,7 @@
-"""A posterior: draws as an ArviZ DataTree, with the model and data they came from."""
+"""A posterior: draws as an ArviZ DataTree, with the model and data they came from.
+
+Groups of the DataTree have ArviZ's names, so that ArviZ works on the saved file as it is.
+"""
 
 from __future__ import annotations
 
@@ -12,21 +15,25 @@ import numpy as np
 import numpyro.distributions as dist
 import xarray as xr
 
-from calibrate.measurements import Observation, missing_values
-from calibrate.posterior.diagnosis import diagnose, summary_of
-from calibrate.posterior.fit import misfits
-from calibrate.posterior.predictions import predicted
-from calibrate.posterior.tree import make_tree
+from calibrate.arviz import base
+from calibrate.measurements import Observation, Observations, missing_values
+from calibrate.posterior import predictions
+from calibrate.posterior.diagnosis import diagnose, misfits, summary_of
 from calibrate.provenance import as_attributes, versions
-from calibrate.samplers import Sampler, check_options, density_of, find_sampler, named_draws
+from calibrate.samplers import check_options, density_of, find_sampler, named_draws
 from calibrate.samplers.checkpoint import Checkpoint, identity_of
 from calibrate.samplers.laplace import MISSED_BY, find_modes, missed_mode
 from calibrate.samplers.protocol import Context
+from calibrate.state_names import split
 from calibrate.statistical_model import Data, FEMLikelihood, Model
 from emulator.core.errors import InputError, check_known
 from emulator.core.representation import TableRepr
 from emulator.core.store import write_netcdf
 from emulator.fem import Simulator
+
+# Keep the keys of replicated data and of the search for modes apart from the sampler's.
+_PREDICTIONS, _MODES = 0x9E3779B9, 0x85EBCA6B
+_WITH_UNITS = ("posterior", "prior", "posterior_predictive", "prior_predictive", "observed_data")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -58,13 +65,7 @@ class Posterior(TableRepr):
         return {n: np.asarray(self.tree["posterior"][n]).reshape(-1) for n in self.model.names}
 
     def thetas(self, state: str | None = None) -> jax.Array:
-        """Return all draws of theta, (s, p), in load state ``state``, or in the only one.
-
-        Raises
-        ------
-        InputError
-            No such state, or several and none is named.
-        """
+        """Return all draws of theta, (s, p), in load state ``state``, by default the only one."""
         states = self.model.states.states
         if state is None and len(states) > 1:
             raise InputError(f"the posterior has several load states: {', '.join(states)}")
@@ -100,7 +101,9 @@ class Posterior(TableRepr):
             if not np.isfinite(value):
                 raise InputError(f"prediction: {name} is {value}; give a finite number")
             thetas = thetas.at[:, scene.parameter_names.index(name)].set(value)
-        return predicted(self.model.full, observe, thetas)
+        key: Any = (self.model.full, observe)
+        outputs = predictions.outputs_of(*key)
+        return outputs.values(thetas).reshape(-1, *observe.shape)
 
     def summary(self, probability: float = 0.9) -> dict[str, dict[str, float]]:
         """Return mean, sd, equal-tailed interval, R-hat, bulk and tail ESS, by parameter."""
@@ -121,7 +124,8 @@ class Posterior(TableRepr):
             for group in groups
         )
         attributes = {str(name): value for name, value in self.tree.attrs.items()}
-        return diagnose(draws, statistics, self.summary(), attributes) + misfits(self.tree)
+        faults = diagnose(draws, statistics, self.summary(), attributes)
+        return [*faults, *misfits(self.tree)]
 
     def save(self, path: str | Path) -> None:
         """Write the DataTree as netCDF, whole or not at all."""
@@ -219,12 +223,20 @@ def sample(
     method = find_sampler(sampler)
     options = check_options(method, options)
     model, checked = model.given(data)
-    fem = _fem_likelihood(method, model, simulator)
+    if simulator is None and method.solves_fem:
+        raise InputError(
+            f"sampler '{method.name}' solves FEM in its second stage: give simulator=..., of the "
+            "posterior's scene"
+        )
+    fem = None if simulator is None else FEMLikelihood(model, simulator)
     record = provenance(model, seed, sampler, options)
-    state = Checkpoint(checkpoint, _identity(record, checked))
-    context = Context(seed, progress, state, fem)
+    # The scene's place is no matter. Messages name the first difference, so what a user changes
+    # most comes first.
+    first = {name: record[name] for name in ("sampler", "seed", "sampler_options")}
+    matters = first | {name: value for name, value in record.items() if name != "scene"}
+    state = Checkpoint(checkpoint, identity_of(matters, checked))
     density = density_of(model)
-    run = method.sample(density, checked, options, context)
+    run = method.sample(density, checked, options, Context(seed, progress, state, fem))
     attributes = dict(run.attributes)
     if MISSED_BY not in attributes:
         z = np.asarray(run.z).reshape(-1, density.dimension)
@@ -239,23 +251,87 @@ def sample(
     return Posterior(tree, model, checked)
 
 
-# Keep the keys of replicated data and of the search for modes apart from the sampler's.
-_PREDICTIONS, _MODES = 0x9E3779B9, 0x85EBCA6B
+def make_tree(
+    model: Model,
+    data: Data,
+    draws: Mapping[str, np.ndarray],
+    statistics: Mapping[str, np.ndarray],
+    rng_key: jax.Array | None,
+    means: Mapping[str, np.ndarray] | None = None,
+) -> xr.DataTree:
+    """Return draws and statistics (chains, draws) by name, with all that follows from them.
+
+    Parameters
+    ----------
+    rng_key : the random key of replicated data; ``None`` leaves out the predictions
+        (``log_likelihood``, ``posterior_predictive``, ``prior``, ``prior_predictive``).
+    means : data without noise at the draws, (chains, draws, *shape) by the observation's name,
+        for draws of FEM's posterior; by default the model's forward map gives them.
+    """
+    constants, dims, coords = labels_of(model.observe)
+    # ArviZ wants a dimension of every observation: a single number gets one of length 1.
+    single = [name for name, values in data.items() if np.ndim(values) == 0]
+    dims |= {name: [f"{name}_number"] for name in single}
+    groups: dict[str, Any] = {
+        "posterior": dict(draws),
+        "sample_stats": dict(statistics),
+        "observed_data": {name: np.atleast_1d(values) for name, values in data.items()},
+        **({"constant_data": constants} if constants else {}),
+    }
+    if rng_key is None:
+        tree = base.from_dict(groups, dims=dims, coords=coords)
+    else:
+        posterior_key, prior_key = jax.random.split(rng_key)
+        rows, some = predictions.spread(draws)
+        own = None if means is None else {n: np.asarray(m)[:, rows] for n, m in means.items()}
+        prior = predictions.prior_replicates(model, prior_key)
+        likelihood = predictions.log_likelihood(model, draws, data, means)
+        replicated = predictions.replicates(model, some, posterior_key, own)
+        replicated_prior = {name: values[None] for name, values in prior.data.items()}
+        for group in (likelihood, replicated, replicated_prior):
+            group |= {name: group[name][..., None] for name in single}
+        groups["posterior_predictive"] = replicated
+        groups["prior"] = {name: values[None] for name, values in prior.draws.items()}
+        groups["prior_predictive"] = replicated_prior
+        tree = base.from_dict(groups, dims=dims, coords=coords)
+        # Dependent data have one number a draw and no data dimensions.
+        full = {name: np.atleast_1d(values).ndim + 2 for name, values in data.items()}
+        pointwise = {n: dims[n] for n, v in likelihood.items() if n in dims and v.ndim == full[n]}
+        used = {name for names in pointwise.values() for name in names}
+        coords = {name: values for name, values in coords.items() if name in used}
+        labelled = base.dict_to_dataset(likelihood, dims=pointwise, coords=coords)  # type: ignore[arg-type]
+        tree["log_likelihood"] = xr.DataTree(labelled)
+        replicated_group = tree["posterior_predictive"].to_dataset()
+        tree["posterior_predictive"] = xr.DataTree(replicated_group.assign_coords(draw=rows))
+    _write_units(tree, model)
+    return tree
 
 
-def _fem_likelihood(
-    sampler: Sampler, model: Model, simulator: Simulator | None
-) -> FEMLikelihood | None:
-    if simulator is None and sampler.solves_fem:
-        raise InputError(
-            f"sampler '{sampler.name}' solves FEM in its second stage: give simulator=..., of the "
-            "posterior's scene"
-        )
-    return None if simulator is None else FEMLikelihood(model, simulator)
+def labels_of(
+    observe: Observations,
+) -> tuple[dict[str, np.ndarray], dict[str, list[str]], dict[str, Any]]:
+    """Return constants, dimensions and coordinates of all observations."""
+    constants: dict[str, np.ndarray] = {}
+    dims: dict[str, list[str]] = {}
+    coords: dict[str, Any] = {}
+    for name, part in observe.parts.items():
+        more = part.labels(name)
+        constants, dims, coords = constants | more[0], dims | more[1], coords | more[2]
+    return constants, dims, coords
 
 
-def _identity(record: Mapping[str, Any], data: Data) -> dict[str, str]:
-    """Return what a run depends on: its record without the scene's place, and its data."""
-    # Messages name the first difference, so what a user changes most comes first.
-    first = {name: record[name] for name in ("sampler", "seed", "sampler_options")}
-    return identity_of(first | {n: v for n, v in record.items() if n != "scene"}, data)
+def _write_units(tree: xr.DataTree, model: Model) -> None:
+    """Write units of parameters, observations, unknown numbers of noise, and positions."""
+    parameters = {p.name: p.unit for p in model.forward.scene.parameters}
+    units = {name: parameters[split(name)[0]] for name in model.states.unknowns}
+    for name, part in model.observe.parts.items():
+        units[name] = part.unit
+        # The unknown numbers of every noise are standard deviations and the like.
+        units |= dict.fromkeys(model.noise_sites[name].values(), part.unit)
+    for group in _WITH_UNITS:
+        if group in tree:
+            for name in units.keys() & tree[group].data_vars:
+                tree[group][name].attrs["units"] = units[name] or "1"
+    if "constant_data" in tree:  # reference positions
+        for constant in tree["constant_data"].data_vars:
+            tree["constant_data"][str(constant)].attrs["units"] = "mm"

@@ -23,7 +23,8 @@ from calibrate.measurements import Observation
 from calibrate.measurements.outputs import Outputs
 from calibrate.noise.correlated import SpatialNormal
 from calibrate.statistical_model import Data, Model
-from emulator.surrogates.protocol import ForwardMap, Prediction, SolvingMap, evaluate_all
+from emulator.surrogates.fem import FEMForward
+from emulator.surrogates.protocol import ForwardMap, Prediction
 
 REPLICATES = 500  # draws of the posterior, and of the prior, at which data is replicated
 
@@ -53,24 +54,12 @@ def log_likelihood(
     means : data without noise (chains, draws, *shape), where the draws are not of the model's own
         posterior; by its forward map otherwise.
     """
-    terms = _programs(model).log_likelihood(_flat(draws), _flat_means(means), data)
+    terms = _over_draws(_log_likelihood, model)((_flat(draws), _flat(means)), data)
     return _unflat(terms, draws)
 
 
-def predicted(forward: ForwardMap, observe: Observation, thetas: jax.Array) -> np.ndarray:
-    """Return the values of ``observe`` without noise, ``(s, *shape)``, at ``thetas`` (s, p).
-
-    Raises
-    ------
-    InputError
-        ``forward`` has no answer at one of them.
-    """
-    key: Any = (forward, observe)
-    return _outputs(*key).values(thetas).reshape(-1, *observe.shape)
-
-
 @lru_cache(maxsize=4)
-def _outputs(forward: ForwardMap, observe: Observation) -> Outputs:
+def outputs_of(forward: ForwardMap, observe: Observation) -> Outputs:
     """Return the outputs; cached, so that a loop over pressures compiles once."""
     return Outputs(forward, {"observed": observe})
 
@@ -82,9 +71,8 @@ def replicates(
 
     ``means`` as of :func:`log_likelihood`.
     """
-    flat = _flat(draws)
-    keys = jax.random.split(rng_key, len(next(iter(flat.values()))))
-    return _unflat(_programs(model).replicate(flat, _flat_means(means), keys), draws)
+    keys = jax.random.split(rng_key, next(iter(draws.values())).size)
+    return _unflat(_over_draws(_replicate, model)((_flat(draws), _flat(means), keys)), draws)
 
 
 def prior_replicates(model: Model, rng_key: jax.Array, count: int = REPLICATES) -> Prior:
@@ -93,10 +81,10 @@ def prior_replicates(model: Model, rng_key: jax.Array, count: int = REPLICATES) 
     A tenth more is drawn; draws where the forward map has no answer are left out.
     """
     keys = jax.random.split(rng_key, count + count // 10)
-    if isinstance(model.forward, SolvingMap):
-        prior = _solved_prior(model, keys)
+    if isinstance(model.forward, FEMForward):
+        prior = _solved_prior(model, model.forward, keys)
     else:
-        prior = _programs(model).prior(keys)
+        prior = _over_draws(_prior, model)((keys,))
     draws, data, valid = jax.tree.map(np.asarray, prior)
     rows = np.flatnonzero(valid)[:count]
     return Prior(*({n: values[rows] for n, values in by.items()} for by in (draws, data)))
@@ -110,8 +98,8 @@ def spread(draws: Draws, count: int = REPLICATES) -> tuple[np.ndarray, Draws]:
     return rows, {name: np.asarray(values)[:, rows] for name, values in draws.items()}
 
 
-def _solved_prior(model: Model, keys: jax.Array) -> Any:
-    """Return the result of the program ``prior``, by solves that are driven from Python.
+def _solved_prior(model: Model, fem: FEMForward, keys: jax.Array) -> Any:
+    """Return :func:`_prior` with each of the keys, by solves that are driven from Python.
 
     The theta of all draws first, then every solve, then the data: keys decide on all of them alike.
     """
@@ -122,7 +110,7 @@ def _solved_prior(model: Model, keys: jax.Array) -> Any:
     )
     draws = jax.jit(jax.vmap(lambda key: prior_of(key, at_rest)[0]))(keys)
     thetas = jax.jit(jax.vmap(states.thetas))({name: draws[name] for name in states.unknowns})
-    solutions = evaluate_all(model.forward, thetas.reshape(-1, thetas.shape[-1]))
+    solutions = fem.evaluate_all(thetas.reshape(-1, thetas.shape[-1]))
     shape = thetas.shape[:2]
     prediction = Prediction(
         solutions.displacement.reshape(*shape, *solutions.displacement.shape[1:]),
@@ -140,47 +128,37 @@ def _prior(model: Model, rng_key: jax.Array, prediction: Prediction | None = Non
     return draw, data, jnp.isfinite(valid["fn"].log_prob(valid["value"]))
 
 
-class _Programs(NamedTuple):
-    # Of draws by name (s,), means by observation (s, *shape) or None, and data or keys (s,); to
-    # numbers by observation (s, *shape).
-    log_likelihood: Callable[..., Any]
-    replicate: Callable[..., Any]
-    prior: Callable[..., Any]  # (keys (s,)) -> draws, data, whether valid (s,)
+def _log_likelihood(
+    model: Model, draw: Data, means: Data | None, data: Data
+) -> dict[str, jax.Array]:
+    if means is not None:
+        around = model.distributions(draw, means)
+        return {name: _pointwise(d, data[name]) for name, d in around.items()}
+    trace = model.trace(draw, data)
+    sites = {name: trace[_site(name)] for name in model.observe.parts}
+    return {name: _pointwise(site["fn"], site["value"]) for name, site in sites.items()}
 
 
-@lru_cache(maxsize=4)
-def _programs(model: Model) -> _Programs:
-    def log_likelihood(
-        draw: dict[str, jax.Array], means: Data | None, data: Data
-    ) -> dict[str, jax.Array]:
-        if means is not None:
-            around = model.distributions(draw, means)
-            return {name: _pointwise(d, data[name]) for name, d in around.items()}
-        trace = model.trace(draw, data)
-        sites = {name: trace[_site(name)] for name in model.observe.parts}
-        return {name: _pointwise(site["fn"], site["value"]) for name, site in sites.items()}
+def _replicate(
+    model: Model, draw: Data, means: Data | None, rng_key: jax.Array
+) -> dict[str, jax.Array]:
+    if means is not None:
+        own, *keys = jax.random.split(rng_key, len(means) + 1)
+        around = model.distributions(draw, model.fem_means(own, draw, means))
+        return {name: d.sample(k) for (name, d), k in zip(around.items(), keys, strict=True)}
+    seeded = handlers.substitute(handlers.seed(model, rng_key), data=dict(draw))
+    trace = handlers.trace(seeded).get_trace()
+    return {name: trace[_site(name)]["value"] for name in model.observe.parts}
 
-    def replicate(
-        draw: dict[str, jax.Array], means: Data | None, rng_key: jax.Array
-    ) -> dict[str, jax.Array]:
-        if means is not None:
-            own, *keys = jax.random.split(rng_key, len(means) + 1)
-            own_means = model.fem_means(own, draw, means)
-            around = model.distributions(draw, own_means)
-            return {name: d.sample(k) for (name, d), k in zip(around.items(), keys, strict=True)}
-        seeded = handlers.substitute(handlers.seed(model, rng_key), data=draw)
-        trace = handlers.trace(seeded).get_trace()
-        return {name: trace[_site(name)]["value"] for name in model.observe.parts}
 
-    # One draw after the other: maps that solve gain nothing from being vectorised.
-    return _Programs(
-        jax.jit(
-            lambda draws, means, data: jax.lax.map(
-                lambda one: log_likelihood(one[0], one[1], data), (draws, means)
-            )
-        ),
-        jax.jit(lambda *each: jax.lax.map(lambda one: replicate(*one), each)),
-        jax.jit(lambda keys: jax.lax.map(partial(_prior, model), keys)),
+@lru_cache(maxsize=12)
+def _over_draws(function: Callable[..., Any], model: Model) -> Callable[..., Any]:
+    """Return the program of ``function(model, *one, *rest)`` over many draws, and the rest.
+
+    It takes one draw after the other: maps that solve gain nothing from being vectorised.
+    """
+    return jax.jit(
+        lambda draws, *rest: jax.lax.map(lambda one: function(model, *one, *rest), draws)
     )
 
 
@@ -198,15 +176,11 @@ def _pointwise(distribution: Any, value: jax.Array) -> jax.Array:
     return each if each.shape == jnp.shape(value) else jnp.sum(each)
 
 
-def _flat(draws: Draws) -> dict[str, jax.Array]:
-    return {name: jnp.asarray(values).reshape(-1) for name, values in draws.items()}
-
-
-def _flat_means(means: Draws | None) -> dict[str, jax.Array] | None:
-    """Return the means with the chains one after the other, (s, *shape)."""
-    if means is None:
+def _flat(values: Draws | None) -> dict[str, jax.Array] | None:
+    """Return the values with the chains one after the other, (s, *shape)."""
+    if values is None:
         return None
-    return {n: jnp.asarray(m).reshape(-1, *np.shape(m)[2:]) for n, m in means.items()}
+    return {n: jnp.asarray(v).reshape(-1, *np.shape(v)[2:]) for n, v in values.items()}
 
 
 def _unflat(values: Any, draws: Draws) -> dict[str, np.ndarray]:

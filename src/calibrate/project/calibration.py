@@ -21,6 +21,7 @@ from calibrate.project.results import (
 )
 from calibrate.project.run import Run
 from calibrate.state_names import split
+from emulator.core.errors import InputError
 from emulator.core.store import write_json
 
 NOT_CERTIFIED = "not certified"
@@ -49,6 +50,11 @@ def infer(
         ``folder`` has the results of an earlier run, or another process is writing to it; the run
         does not fit its scene or its data.
     """
+    if not isinstance(run, Run | Problem):
+        raise InputError(
+            f"infer: {type(run).__name__} is not one run; calibrate infer FILE takes members of a "
+            "population, and calibrate.hierarchy their models"
+        )
     target = None if folder is None else Path(folder)
     with nullcontext() if target is None else reserved(target, force=force):
         problem = with_data(read_problem(run))

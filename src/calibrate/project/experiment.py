@@ -135,7 +135,7 @@ def _without(table: Mapping[str, Any], entries: Mapping[str, Any]) -> dict[str, 
     replaced = set[str]()
     if "forward" in entries:
         replaced.add("forward_options")
-        replaced |= set() if forward_kind(entries["forward"]).from_emulator else {"emulator"}
+        replaced |= {"emulator"} - set(forward_kind(entries["forward"]).words)
     if entries.get("data", SYNTHETIC) != SYNTHETIC:
         replaced |= {"truth", "observe"}
     return {name: value for name, value in table.items() if name not in replaced}

@@ -106,7 +106,7 @@ class Run:
 
     def __post_init__(self) -> None:
         registry.full_options(self.forward, self.forward_options)
-        registry.check_emulator(self.forward, self.emulator)
+        registry.check_words(self.forward, emulator=self.emulator)
         least = dict.fromkeys(("warmup", "draws", "chains", "load_steps"), 1)
         for name in (*least, "error_runs", "mesh_error_runs", "seed"):
             if (value := getattr(self, name)) < least.get(name, 0):

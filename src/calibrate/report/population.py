@@ -24,7 +24,7 @@ from calibrate.population import Hierarchy
 from calibrate.population.model import MEDIAN, SD
 from calibrate.population.posterior import CORRELATION
 from calibrate.posterior import read_tree
-from calibrate.posterior.fit import misfits
+from calibrate.posterior.diagnosis import misfits
 from calibrate.project.calibration import NOT_CERTIFIED
 from calibrate.project.members import POPULATION, Members, Shared, verdicts_in
 from calibrate.project.results import MEMBERS, POSTERIOR, REPORT

@@ -1,7 +1,7 @@
 """Maps from theta to displacement: the protocol, and all kinds of maps."""
 
 from emulator.surrogates.emulator import CachedEmulator, Emulator, load, save_emulator, shipped
-from emulator.surrogates.network.graph import AugmentedGraph, GraphOptions, augment
+from emulator.surrogates.network.graph import AugmentedGraph, augment
 from emulator.surrogates.network.pignn import Architecture
 
 __all__ = [
@@ -9,7 +9,6 @@ __all__ = [
     "AugmentedGraph",
     "CachedEmulator",
     "Emulator",
-    "GraphOptions",
     "augment",
     "load",
     "save_emulator",

@@ -26,7 +26,7 @@ from emulator.core.store import inside
 from emulator.scenes.finer import Finer
 from emulator.scenes.scene import Scene
 from emulator.surrogates.discrepancy import Discrepancy
-from emulator.surrogates.part import CachedPart, Part, widened
+from emulator.surrogates.part import CachedPart, Part, arrays_of, together, widened
 from emulator.surrogates.polynomial import Polynomial
 from emulator.surrogates.taylor import Expansion
 
@@ -51,33 +51,24 @@ class Coarse:
     def __call__(self, position: jax.Array) -> jax.Array:
         """Return the displacement (n, 3) mm of the finer mesh's nodes at ``position`` (p,)."""
         cached = self.cache(np.arange(self.prolongation.shape[0]))
-        return jnp.asarray(cached.offset) + jnp.tensordot(
-            cached.coefficients(position), cached.modes, axes=1
-        )
+        free = jnp.tensordot(cached.coefficients(position), cached.modes, axes=1)
+        return jnp.asarray(cached.offset) + free
 
     def cache(self, nodes: np.ndarray) -> CachedPart:
         """Return the part over ``nodes`` (k,) of the finer mesh."""
         rows = self.prolongation[nodes]
         coarse_nodes = np.unique(rows.indices)
-        carry, cached = (
-            rows[:, coarse_nodes],
-            [part.cache(coarse_nodes) for part in self.parts.values()],
-        )
-        offset = carry @ sum((part.offset for part in cached), np.zeros((len(coarse_nodes), 3)))
-        modes = np.concatenate([part.modes for part in cached])
-        flat = carry @ modes.transpose(1, 0, 2).reshape(len(coarse_nodes), -1)
-        return CachedPart(
-            offset,
-            flat.reshape(len(nodes), len(modes), 3).transpose(1, 0, 2),
-            lambda position: jnp.concatenate([part.coefficients(position) for part in cached]),
-        )
+        coarse = [part.cache(coarse_nodes) for part in self.parts.values()]
+        cached, carry = together(coarse, len(coarse_nodes)), rows[:, coarse_nodes]
+        modes = carry @ cached.modes.transpose(1, 0, 2).reshape(len(coarse_nodes), -1)
+        modes = modes.reshape(len(nodes), -1, 3).transpose(1, 0, 2)
+        return CachedPart(carry @ cached.offset, modes, cached.coefficients)
 
     def arrays(self) -> dict[str, Any]:
         """Return the arrays of all parts, as ``taylor/derivatives``, and of the prolongation."""
-        rows = self.prolongation
-        arrays = {f"{n}/{k}": a for n, part in self.parts.items() for k, a in part.arrays().items()}
-        matrix = {name: getattr(rows, name) for name in ("data", "indices", "indptr")}
-        return arrays | {f"prolongation/{name}": array for name, array in matrix.items()}
+        names = ("data", "indices", "indptr")
+        matrix = {f"prolongation/{name}": getattr(self.prolongation, name) for name in names}
+        return arrays_of(self.parts) | matrix
 
     def to_json(self) -> dict[str, Any]:
         """Return the number of nodes of the coarse mesh, and the JSON of the parts."""
@@ -102,10 +93,7 @@ class Coarse:
 def carried(parts: Mapping[str, Part], body: Finer) -> Coarse:
     """Return the ``parts`` of an emulator of ``body.coarse`` on the finer mesh.
 
-    Raises
-    ------
-    InputError
-        No parts, or one that is not a series, a polynomial or a discrepancy.
+    :class:`InputError` for no parts, or one that is no series, polynomial or discrepancy.
     """
     if not parts or not set(parts) <= set(_PARTS):
         raise InputError(

@@ -66,10 +66,8 @@ class CorrectedForward:
     @cached_property
     def fingerprint(self) -> str:
         """Short hash of ``base``, the scene whose equilibrium is sought, steps and nodes."""
-        equilibrium = self.simulator.scene.fingerprint
-        return fingerprint_of(
-            self.kind, self.base.fingerprint, equilibrium, str(self.steps), self.nodes
-        )
+        prints = self.base.fingerprint, self.simulator.scene.fingerprint
+        return fingerprint_of(self.kind, *prints, str(self.steps), self.nodes)
 
     @cached_property
     def _corrected(self):  # noqa: ANN202 - a closure with its derivative, private
@@ -118,7 +116,6 @@ def corrected(base: ForwardMap, simulator: Simulator, steps: int = 1) -> Correct
 
 
 def _build(ingredients: Ingredients, options: Options) -> ForwardMap:
-    """Return the emulator followed by Newton steps."""
     return corrected(EMULATOR.build(ingredients, {}), ingredients.simulator, options["steps"])
 
 
@@ -127,5 +124,5 @@ CORRECTED = ForwardKind(
     "an emulator followed by Newton steps",
     _build,
     (Option("steps", 1, "Newton steps of the corrected map"),),
-    from_emulator=True,
+    words=("emulator",),
 )

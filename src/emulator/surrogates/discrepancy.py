@@ -64,11 +64,6 @@ class Warp(NamedTuple):
         polynomials = monomials(self.indices, position - self.centre) @ self.coefficients
         return jnp.concatenate([position, polynomials]) * self.inverse_lengths
 
-    def with_derivatives(self, positions: jax.Array) -> Features:
-        """Return the features of ``positions`` (c, p) and their derivatives in position."""
-        features: Callable[[jax.Array], jax.Array] = self.__call__
-        return Features(jax.vmap(features)(positions), jax.vmap(jax.jacfwd(features))(positions))
-
 
 @dataclass(frozen=True, eq=False)
 class Discrepancy(ArrayPart):
@@ -91,11 +86,8 @@ class Discrepancy(ArrayPart):
     def coefficients(self, position: jax.Array) -> jax.Array:
         """Return the coefficients (r,) of the modes at ``position`` (p,) in the unit box.
 
-        Raises
-        ------
-        InputError
-            float64 is off. The weights of nearly equal runs are large and cancel: in float32 the
-            shipped ventricle would be 9 mm off.
+        In float32 it refuses: the weights of nearly equal runs are large and cancel, and the
+        shipped ventricle would be 9 mm off.
         """
         require_float64("a discrepancy model")
         return mean(self.warp(position), self.known, self.value_weights, self.derivative_weights)
@@ -137,19 +129,14 @@ def fit_discrepancy(
     offset = fields.mean(axis=0)
     modes, observations = _project(fields - offset, sensitivities)
     warp = _warp(expansion, positions.shape[1])
-    features = warp.with_derivatives(positions)
+    psi: Callable[[jax.Array], jax.Array] = warp.__call__
+    features = Features(jax.vmap(psi)(positions), jax.vmap(jax.jacfwd(psi))(positions))
     lengths = _lengths(features, np.asarray(positions), observations)
     warp = warp._replace(inverse_lengths=lengths)
     scaled = features.scaled(lengths)
     values, folded = fold(scaled, fit_weights(scaled, observations))
-    return Discrepancy(
-        warp=warp,
-        known=scaled.value,
-        value_weights=values,
-        derivative_weights=folded,
-        offset=jnp.asarray(offset),
-        modes=jnp.asarray(modes.reshape(-1, *offset.shape)),
-    )
+    nodal_modes = jnp.asarray(modes.reshape(-1, *offset.shape))
+    return Discrepancy(warp, scaled.value, values, folded, jnp.asarray(offset), nodal_modes)
 
 
 def _check(scene: Scene, runs: Runs, expansion: Expansion) -> None:
@@ -221,10 +208,10 @@ def _lengths(features: Features, positions: np.ndarray, observations: jax.Array)
 
 def _warp(expansion: Expansion, parameters: int) -> Warp:
     """Return position, and the coefficients of the series' leading modes over the box."""
-    if not len(expansion.indices):
-        plain = jnp.zeros((0, 0))
-        return Warp(expansion.centre, expansion.indices, plain, jnp.ones(parameters))
-    derivatives = np.asarray(expansion.derivatives).reshape(len(expansion.indices), -1)
+    centre, indices = expansion.centre, expansion.indices
+    if not len(indices):
+        return Warp(centre, indices, jnp.zeros((0, 0)), jnp.ones(parameters))
+    derivatives = np.asarray(expansion.derivatives).reshape(len(indices), -1)
     samples = np.random.default_rng(0).random((_FEATURE_SAMPLES, parameters))
     weights = np.asarray(expansion.monomials(jnp.asarray(samples)))
     # Left singular vectors of the sampled fields, from the Gram matrix of the derivatives (t, t).
@@ -233,12 +220,7 @@ def _warp(expansion: Expansion, parameters: int) -> Warp:
     _, size, right = np.linalg.svd(weights @ root, full_matrices=False)
     count = min(_FEATURES, int(np.sum(size > 1e-6 * size[0])))
     coefficients = (root @ right[:count].T) / (size[:count] / np.sqrt(_FEATURE_SAMPLES))
-    return Warp(
-        expansion.centre,
-        expansion.indices,
-        jnp.asarray(coefficients),
-        jnp.ones(parameters + count),
-    )
+    return Warp(centre, indices, jnp.asarray(coefficients), jnp.ones(parameters + count))
 
 
 def maximin_subset(positions: np.ndarray, count: int) -> np.ndarray:

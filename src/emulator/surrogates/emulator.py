@@ -28,15 +28,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.catalogue import scene_from_origin
-from emulator.core.errors import InputError
+from emulator.core.errors import InputError, look_up
 from emulator.core.representation import TableRepr
 from emulator.core.store import inside, read_arrays, read_json, save_arrays, write_json
 from emulator.scenes.scene import Scene, all_nodes, check_nodes
 from emulator.surrogates.coarse import Coarse
 from emulator.surrogates.discrepancy import Discrepancy
+from emulator.surrogates.network import Network
 from emulator.surrogates.network.family import FamilyNetwork
-from emulator.surrogates.network.part import Network
-from emulator.surrogates.part import CachedPart, Part
+from emulator.surrogates.part import CachedPart, Part, arrays_of, together
 from emulator.surrogates.polynomial import Polynomial
 from emulator.surrogates.protocol import (
     ForwardKind,
@@ -131,19 +131,19 @@ class Emulator(TableRepr):
     def cache(self, nodes: np.ndarray | None = None) -> CachedEmulator:
         """Return the forward map over ``nodes``, all by default, from one processor pass."""
         nodes = all_nodes(self.scene) if nodes is None else check_nodes(self.scene, nodes)
-        cached = tuple(part.cache(nodes) for part in self.parts.values())
-        return CachedEmulator(self, cached, nodes)
+        cached = [part.cache(nodes) for part in self.parts.values()]
+        return CachedEmulator(self, together(cached, len(nodes)), nodes)
 
 
 @dataclass(frozen=True, eq=False)
 class CachedEmulator:
     """An emulator over some nodes, with all evaluated that does not depend on theta.
 
-    The modes of all parts are one matrix, so that a displacement is one product.
+    The modes of all its parts are one matrix of ``part``, so that a displacement is one product.
     """
 
     emulator: Emulator
-    parts: tuple[CachedPart, ...]
+    part: CachedPart
     nodes: np.ndarray
 
     kind = "emulator"
@@ -157,33 +157,21 @@ class CachedEmulator:
     @property
     def fingerprint(self) -> str:
         """Short hash of scene, emulator and nodes."""
-        return fingerprint_of(
-            self.kind, self.scene.fingerprint, self.emulator.fingerprint, self.nodes
-        )
-
-    @cached_property
-    def _linear(self) -> tuple[np.ndarray, np.ndarray]:
-        """Offset (k, 3) and modes (t, 3 k) in mm of all parts together."""
-        count = len(self.nodes)
-        offset = sum((part.offset for part in self.parts), np.zeros((count, 3)))
-        modes = np.concatenate([np.zeros((0, count, 3)), *(part.modes for part in self.parts)])
-        return offset, modes.reshape(len(modes), 3 * count)
+        prints = self.scene.fingerprint, self.emulator.fingerprint
+        return fingerprint_of(self.kind, *prints, self.nodes)
 
     def coefficients(self, theta: jax.Array) -> jax.Array:
         """Return the coefficients (t,) of all parts' modes at ``theta`` (p,)."""
-        position = self.scene.to_unit(theta)
-        return jnp.concatenate(
-            [jnp.zeros(0), *(part.coefficients(position) for part in self.parts)]
-        )
+        return self.part.coefficients(self.scene.to_unit(theta))
 
     def __call__(self, theta: jax.Array) -> jax.Array:
         """Return the displacement (..., k, 3) mm at ``theta`` (..., p)."""
-        offset, modes = self._linear
+        part, shape = self.part, self.part.offset.shape
         coefficients = jnp.vectorize(self.coefficients, signature="(p)->(t)")(theta)
-        free = offset + (coefficients @ modes).reshape(*theta.shape[:-1], *offset.shape)
-        for part in self.parts:
-            if part.field is not None:
-                free = free + part.field(self.scene.to_unit(theta))
+        free = coefficients @ part.modes.reshape(-1, shape[0] * 3)
+        free = part.offset + free.reshape(*theta.shape[:-1], *shape)
+        if part.decode is not None and part.prepared is not None:
+            free = free + part.decode(part.prepared, self.scene.to_unit(theta))
         return self.scene.on_supports(free, theta, self.nodes)
 
     def evaluate(self, theta: jax.Array) -> Prediction:
@@ -193,23 +181,15 @@ class CachedEmulator:
     def at(self, nodes: np.ndarray) -> CachedEmulator:
         """Return the same map over ``nodes``, which must be among those cached."""
         rows = rows_of(self, nodes)
-        parts = tuple(part.at(rows) for part in self.parts)
-        return replace(self, parts=parts, nodes=self.nodes[rows])
+        return replace(self, part=self.part.at(rows), nodes=self.nodes[rows])
 
 
 def save_emulator(emulator: Emulator, folder: str | Path) -> None:
-    """Write ``emulator`` into ``folder``.
-
-    The array ``derivatives`` of the part ``taylor`` is called ``taylor/derivatives``, and so on.
-    """
+    """Write ``emulator`` into ``folder``; :class:`InputError` for one without any part."""
     folder = Path(folder)
     if not emulator.parts:
         raise InputError("an emulator without any part has nothing to save")
-    arrays = {
-        f"{name}/{key}": _narrow(array)
-        for name, part in emulator.parts.items()
-        for key, array in part.arrays().items()
-    }
+    arrays = {name: _narrow(array) for name, array in arrays_of(emulator.parts).items()}
     digest = save_arrays(folder / "weights.safetensors", arrays)
     write_json(
         folder / "emulator.json",
@@ -238,15 +218,6 @@ def shipped() -> list[str]:
     return sorted(path.parent.name for path in SHIPPED.glob("*/emulator.json"))
 
 
-def shipped_for(scene: str) -> list[str]:
-    """Return the names of the emulators that come with the package for the built-in ``scene``."""
-    return [
-        name
-        for name in shipped()
-        if read_json(SHIPPED / name / "emulator.json")["scene"].get("scene") == scene
-    ]
-
-
 def load(name: str | Path, scene: Scene | None = None) -> Emulator:
     """Return the emulator in folder ``name``, or the shipped one of that name.
 
@@ -267,74 +238,43 @@ def load(name: str | Path, scene: Scene | None = None) -> Emulator:
             f"emulator '{name}' is neither shipped nor a folder with emulator.json; "
             f"shipped: {', '.join(shipped()) or 'none'}"
         )
-    description = read_json(folder / "emulator.json")
+    file, weights = folder / "emulator.json", folder / "weights.safetensors"
+    description = read_json(file)
     try:
-        _check_description(folder, description)
-        scene = _matching_scene(name, description, scene)
-        arrays = _arrays(folder / "weights.safetensors", description["weights_sha256"])
+        if description["format"] != FORMAT:
+            raise InputError(
+                f"{file} has format {description['format']}; this version reads {FORMAT}: train "
+                "the emulator again"
+            )
+        kinds = {part: look_up(PARTS, part, f"{file}: part") for part in description["parts"]}
+        scene = scene_from_origin(description["scene"]) if scene is None else scene
+        if scene.fingerprint != description["fingerprint"]:
+            raise InputError(
+                f"emulator '{name}' was trained for a scene with fingerprint "
+                f"{description['fingerprint']}; '{scene.name}' has {scene.fingerprint}: train one "
+                "for this scene"
+            )
+        arrays, _ = read_arrays(weights)
+        if hashlib.sha256(weights.read_bytes()).hexdigest() != description["weights_sha256"]:
+            raise InputError(f"{weights} is not the file emulator.json was written with")
     except (KeyError, TypeError) as error:
-        raise InputError(f"{folder}/emulator.json lacks or garbles {error}") from error
-    parts = {
-        name: _restore(folder, name, scene, part, inside(arrays, name))
-        for name, part in description["parts"].items()
-    }
+        raise InputError(f"{file} lacks or garbles {error}") from error
+    parts: dict[str, Any] = {}
+    for part, kind in kinds.items():
+        try:
+            parts[part] = kind.restore(scene, description["parts"][part], inside(arrays, part))
+        except (KeyError, TypeError) as error:
+            raise InputError(f"{folder}: its part '{part}' lacks or garbles {error}") from error
+        except InputError as error:
+            raise InputError(f"{folder}: its part '{part}': {error}") from error
     return Emulator(scene, **parts, record=description.get("record", {}))
 
 
-def _restore(
-    folder: Path,
-    name: str,
-    scene: Scene,
-    description: Mapping[str, Any],
-    arrays: Mapping[str, np.ndarray],
-) -> Any:
-    """Return the part ``name``; errors name the folder and the part."""
-    try:
-        return PARTS[name].restore(scene, description, arrays)
-    except (KeyError, TypeError) as error:
-        raise InputError(f"{folder}: its part '{name}' lacks or garbles {error}") from error
-    except InputError as error:
-        raise InputError(f"{folder}: its part '{name}': {error}") from error
-
-
-def _check_description(folder: Path, description: Mapping[str, Any]) -> None:
-    if description["format"] != FORMAT:
-        raise InputError(
-            f"{folder}/emulator.json has format {description['format']}; this version reads "
-            f"{FORMAT}: train the emulator again"
-        )
-    unknown = [name for name in description["parts"] if name not in PARTS]
-    if unknown:
-        raise InputError(
-            f"{folder}/emulator.json: part '{unknown[0]}' is unknown; known: {', '.join(PARTS)}"
-        )
-
-
-def _matching_scene(name: str | Path, description: Mapping[str, Any], scene: Scene | None) -> Scene:
-    """Return ``scene``, by default the one of the training; refuse another fingerprint."""
-    fingerprint = description["fingerprint"]
-    scene = scene_from_origin(description["scene"]) if scene is None else scene
-    if scene.fingerprint != fingerprint:
-        raise InputError(
-            f"emulator '{name}' was trained for a scene with fingerprint {fingerprint}; "
-            f"'{scene.name}' has {scene.fingerprint}: train one for this scene"
-        )
-    return scene
-
-
-def _arrays(path: Path, digest: str) -> dict[str, np.ndarray]:
-    arrays, _ = read_arrays(path)
-    if hashlib.sha256(path.read_bytes()).hexdigest() != digest:
-        raise InputError(f"{path} is not the file emulator.json was written with")
-    return arrays
-
-
 def _build(ingredients: Ingredients, _: Options) -> ForwardMap:
-    """Return the emulator that is named, by default the one shipped for the scene."""
     name = ingredients.scene.name if ingredients.emulator is None else ingredients.emulator
     return ingredients.ranged(load(name, ingredients.scene).cache())
 
 
 EMULATOR = ForwardKind(
-    "emulator", "a trained emulator, shipped or in a folder", _build, from_emulator=True
+    "emulator", "a trained emulator, shipped or in a folder", _build, words=("emulator",)
 )

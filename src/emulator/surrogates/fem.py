@@ -9,22 +9,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.core.errors import InputError
 from emulator.core.store import to_json
 from emulator.fem.campaign import Executor, Row, Solver, in_process, solve_rows
 from emulator.fem.simulator import Simulator
 from emulator.scenes.scene import Scene, all_nodes, check_nodes
-from emulator.surrogates.protocol import (
-    ForwardKind,
-    ForwardMap,
-    Prediction,
-    SolvingMap,
-    fingerprint_of,
-)
+from emulator.surrogates.protocol import ForwardKind, ForwardMap, Prediction, fingerprint_of
 
 
 @dataclass(frozen=True, eq=False)
-class FEMForward(SolvingMap):
-    """The simulator as a forward map.
+class FEMForward:
+    """The simulator as a forward map: its predictions at many theta are done by an executor.
+
+    All other maps are compiled and differentiated by JAX.
 
     simulator, nodes : the simulator, and the nodes (k,) whose displacement is returned.
     start : the map that predicts where Newton's method begins; ``None`` for the body at rest.
@@ -58,26 +55,23 @@ class FEMForward(SolvingMap):
 
     def evaluate_all(self, thetas: jax.Array) -> Prediction:
         """Return the predictions at many theta (c, p), which ``execute`` solves."""
-        return self._predicted(self._rows(thetas))
+        return self._solved(thetas)[0]
 
     def slopes_all(self, thetas: jax.Array) -> tuple[Prediction, jax.Array]:
         """Return the predictions at many theta (c, p), and du/dtheta (c, p, k, 3)."""
-        rows = self._rows(thetas, sensitivities=True)
-        slopes = jnp.stack([row.sensitivities[:, self.nodes] for row in rows])
-        return self._predicted(rows), slopes
+        prediction, rows = self._solved(thetas, sensitivities=True)
+        return prediction, jnp.stack([row.sensitivities[:, self.nodes] for row in rows])
 
-    def _predicted(self, rows: list[Row]) -> Prediction:
-        return Prediction(
-            jnp.stack([row.solution.displacement[self.nodes] for row in rows]),
-            jnp.stack([row.solution.converged for row in rows]),
-        )
-
-    def _rows(self, thetas: jax.Array, *, sensitivities: bool = False) -> list[Row]:
+    def _solved(
+        self, thetas: jax.Array, *, sensitivities: bool = False
+    ) -> tuple[Prediction, list[Row]]:
         solver = Solver(self.simulator, sensitivities=sensitivities, from_rest_again=False)
         start = self.start
         starts = (lambda _: ()) if start is None else (lambda number: (start(thetas[number]),))
-        rows = solve_rows(solver, thetas, starts=starts, execute=self.execute)
-        return sorted(rows, key=lambda row: row.number)
+        solved = solve_rows(solver, thetas, starts=starts, execute=self.execute)
+        rows = sorted(solved, key=lambda row: row.number)
+        u = jnp.stack([row.solution.displacement[self.nodes] for row in rows])
+        return Prediction(u, jnp.stack([row.solution.converged for row in rows])), rows
 
     def __call__(self, theta: jax.Array) -> jax.Array:
         """Return the displacement (k, 3) mm."""
@@ -87,19 +81,25 @@ class FEMForward(SolvingMap):
         """Return the same map over other ``nodes``."""
         return replace(self, nodes=check_nodes(self.scene, nodes))
 
-    def solved_by(self, execute: Executor) -> FEMForward:
-        """Return the same map, whose solves at many theta are done by ``execute``."""
-        return replace(self, execute=execute)
-
 
 def fem_forward(simulator: Simulator, start: ForwardMap | None = None) -> FEMForward:
     """Return the simulator as a forward map over all nodes; ``start`` predicts its starts."""
     return FEMForward(simulator, all_nodes(simulator.scene), start)
 
 
+def solved_by(forward: ForwardMap, execute: Executor) -> FEMForward:
+    """Return ``forward`` with its solves done by ``execute``; refuse a map that solves nothing."""
+    if not isinstance(forward, FEMForward):
+        raise InputError(
+            f"a {forward.kind} map solves no FEM, so a scheduler has no effect; take fem_forward, "
+            "or leave the scheduler out"
+        )
+    return replace(forward, execute=execute)
+
+
 FEM = ForwardKind(
     "fem",
     "finite elements, from rest each time",
     lambda ingredients, _: fem_forward(ingredients.simulator),
-    solves_fem=True,
+    words=("scheduler",),
 )

@@ -9,7 +9,7 @@ with a pointwise decoder has a field :math:`d` that is not a sum of modes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Protocol, Self, get_type_hints
 
@@ -48,6 +48,11 @@ class Part(Protocol):
         ...
 
 
+def arrays_of(parts: Mapping[str, Part]) -> dict[str, Any]:
+    """Return the arrays of parts by name, such as ``taylor/derivatives``."""
+    return {f"{n}/{k}": array for n, part in parts.items() for k, array in part.arrays().items()}
+
+
 class ArrayPart:
     """A part whose fields are all arrays, or named tuples of arrays: what files keep of it.
 
@@ -57,9 +62,8 @@ class ArrayPart:
 
     def arrays(self) -> dict[str, Any]:
         """Return all arrays by name."""
-        values = {each.name: getattr(self, each.name) for each in fields(self)}  # type: ignore[arg-type]
-        plain = {n: v._asdict() if hasattr(v, "_asdict") else v for n, v in values.items()}
-        return named_leaves(plain)
+        values = ((each.name, getattr(self, each.name)) for each in fields(self))  # type: ignore[arg-type]
+        return named_leaves({n: v._asdict() if hasattr(v, "_asdict") else v for n, v in values})
 
     def to_json(self) -> dict[str, Any]:
         """Return nothing: the arrays are all."""
@@ -87,18 +91,6 @@ def _fill(kind: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     return kind(**values)
 
 
-class NodalField(Protocol):
-    """Displacement of some nodes as a function of position, not a sum of modes."""
-
-    def __call__(self, position: jax.Array) -> jax.Array:
-        """Return the displacement (..., k, 3) mm at ``position`` (..., p)."""
-        ...
-
-    def at(self, rows: np.ndarray) -> NodalField:
-        """Return the field over some rows of its nodes."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class CachedPart:
     """A part over k nodes.
@@ -106,24 +98,33 @@ class CachedPart:
     offset, modes : (k, 3) mm and (t, k, 3) mm. They are NumPy's, because a JAX array that is made
         while a caller is traced would belong to that trace.
     coefficients : the function from position (p,) to the coefficients (t,) of the modes.
-    field : the field that is not a sum of modes, or ``None``.
+    prepared, decode : for a field that is not a sum of modes, all of it that does not depend on
+        theta, (c, k, h), and the function from that and a position (..., p) to (..., k, 3) mm.
     """
 
     offset: np.ndarray
     modes: np.ndarray
     coefficients: Callable[[jax.Array], jax.Array]
-    field: NodalField | None = None
+    prepared: jax.Array | None = None
+    decode: Callable[[jax.Array, jax.Array], jax.Array] | None = None
 
     def at(self, rows: np.ndarray) -> CachedPart:
         """Return the part over some rows of its nodes."""
-        field = None if self.field is None else self.field.at(rows)
-        return replace(self, offset=self.offset[rows], modes=self.modes[:, rows], field=field)
+        prepared = None if self.prepared is None else self.prepared[:, rows]
+        return replace(self, offset=self.offset[rows], modes=self.modes[:, rows], prepared=prepared)
 
 
-def no_modes(nodes: np.ndarray, field: NodalField) -> CachedPart:
-    """Return a part that is nothing but ``field`` over ``nodes`` (k,)."""
-    count = len(nodes)
-    return CachedPart(np.zeros((count, 3)), np.zeros((0, count, 3)), lambda _: jnp.zeros(0), field)
+def together(parts: Sequence[CachedPart], count: int) -> CachedPart:
+    """Return the sum of ``parts`` over ``count`` nodes; at most one of them has another field."""
+    nothing = CachedPart(np.zeros((count, 3)), np.zeros((0, count, 3)), lambda _: jnp.zeros(0))
+    terms = [nothing, *parts]
+    other = next((part for part in parts if part.decode is not None), nothing)
+    return replace(
+        other,
+        offset=sum((part.offset for part in parts), nothing.offset),
+        modes=np.concatenate([part.modes for part in terms]),
+        coefficients=lambda x: jnp.concatenate([part.coefficients(x) for part in terms]),
+    )
 
 
 def widened(array: np.ndarray) -> np.ndarray:

@@ -79,18 +79,11 @@ class ReducedForward:
         return fingerprint_of(self.kind, self.scene.fingerprint, *arrays)
 
     def __call__(self, theta: jax.Array) -> jax.Array:
-        """Return the displacement (k, 3) mm at ``theta`` (p,).
-
-        Raises
-        ------
-        InputError
-            float64 is off.
-        """
+        """Return the displacement (k, 3) mm at ``theta`` (p,); refuse to do so in float32."""
         require_float64("a reduced model")
         gap = (self.scene.to_unit(theta) - self.inputs)[None] / self.lengths[:, None]
-        coefficients = jnp.sum(
-            self.weights * squared_exponential(jnp.sum(gap**2, axis=-1)), axis=-1
-        )
+        correlations = squared_exponential(jnp.sum(gap**2, axis=-1))
+        coefficients = jnp.sum(self.weights * correlations, axis=-1)
         u = self.mean + jnp.tensordot(coefficients, self.modes, axes=1)
         return self.scene.on_supports(u, theta, self.nodes)
 
@@ -100,37 +93,25 @@ class ReducedForward:
 
     def at(self, nodes: np.ndarray) -> ReducedForward:
         """Return the map restricted to ``nodes``, all of which must be among its own."""
-        rows = rows_of(self, nodes)
-        return replace(
-            self, nodes=self.nodes[rows], mean=self.mean[rows], modes=self.modes[:, rows]
-        )
+        r = rows_of(self, nodes)
+        return replace(self, nodes=self.nodes[r], mean=self.mean[r], modes=self.modes[:, r])
 
 
 def fit_reduced(scene: Scene, runs: Runs, *, truncation: float = 1e-9) -> ReducedForward:
-    """Fit the reduced model to FEM runs.
+    """Fit the reduced model to FEM runs; :class:`InputError` where there are fewer than 3.
 
-    Parameters
-    ----------
     truncation : the fraction of the largest singular value below which modes are left out.
-
-    Raises
-    ------
-    InputError
-        Fewer than 3 runs.
     """
     if len(runs.theta) < 3:
         raise InputError(f"a reduced model needs 3 FEM runs or more; there are {len(runs.theta)}")
     snapshots = np.asarray(runs.displacement)
     mean = snapshots.mean(axis=0)
-    left, size, right = np.linalg.svd(
-        (snapshots - mean).reshape(len(snapshots), -1), full_matrices=False
-    )
+    flat, root = (snapshots - mean).reshape(len(snapshots), -1), np.sqrt(len(snapshots))
+    left, size, right = np.linalg.svd(flat, full_matrices=False)
     significant = size > truncation * size[0]
     inputs = np.asarray(scene.to_unit(runs.theta))
-    processes = [
-        _fit_one(inputs, column) for column in (left[:, significant] * np.sqrt(len(snapshots))).T
-    ]
-    modes = right[significant] * size[significant, None] / np.sqrt(len(snapshots))
+    processes = [_fit_one(inputs, column) for column in (left[:, significant] * root).T]
+    modes = right[significant] * size[significant, None] / root
     return ReducedForward(
         scene=scene,
         nodes=all_nodes(scene),
@@ -160,14 +141,9 @@ def _fit_one(inputs: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _build(ingredients: Ingredients, options: Options) -> ForwardMap:
-    """Return a reduced model fitted to FEM runs at a Sobol sequence of theta."""
     thetas = sobol(ingredients.scene, options["fem_runs"], ingredients.seed)
     runs = run_campaign(ingredients.simulator, thetas, progress=ingredients.progress)
     return ingredients.ranged(fit_reduced(ingredients.scene, runs))
-
-
-def _to_arrays(forward: ForwardMap) -> Arrays:
-    return {name: np.asarray(getattr(forward, name)) for name in _ARRAYS}
 
 
 def _from_arrays(scene: Scene, arrays: Arrays) -> ReducedForward:
@@ -180,6 +156,6 @@ REDUCED = ForwardKind(
     "POD and Gaussian processes of a few FEM runs",
     _build,
     (Option("fem_runs", 30, "FEM runs that the reduced model is fitted to", least=3),),
-    _to_arrays,
+    lambda forward: {name: np.asarray(getattr(forward, name)) for name in _ARRAYS},
     _from_arrays,
 )

@@ -7,7 +7,6 @@ A kind of forward map is one :class:`ForwardKind` next to its map, and one line 
 from __future__ import annotations
 
 import hashlib
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
@@ -17,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.errors import InputError
-from emulator.fem.campaign import Executor
 from emulator.fem.simulator import Simulator
 from emulator.scenes.scene import Scene, check_nodes
 
@@ -30,32 +28,29 @@ class Prediction(NamedTuple):
 
 
 class ForwardMap(Protocol):
-    """Theta to displacement, differentiable, usable under ``jit`` and ``vmap``."""
+    """Theta to displacement, differentiable, usable under ``jit`` and ``vmap``.
+
+    kind, label : the names of its kind, e.g. ``corrected``, and of the map in pictures and tables,
+        e.g. ``emulator + 2 Newton steps``.
+    scene : the scene whose displacement it predicts.
+    nodes : the nodes at which it predicts, (k,), in the order of its rows.
+    fingerprint : a short hash of everything that shapes the prediction (:func:`fingerprint_of`).
+    """
 
     @property
-    def kind(self) -> str:
-        """Name of its kind, e.g. ``emulator`` or ``fem``."""
-        ...
+    def kind(self) -> str: ...  # noqa: D102
 
     @property
-    def label(self) -> str:
-        """The name in pictures and tables, e.g. ``emulator + 2 Newton steps``."""
-        ...
+    def label(self) -> str: ...  # noqa: D102
 
     @property
-    def scene(self) -> Scene:
-        """The scene whose displacement it predicts."""
-        ...
+    def scene(self) -> Scene: ...  # noqa: D102
 
     @property
-    def nodes(self) -> np.ndarray:
-        """Nodes at which it predicts, (k,), in the order of its rows."""
-        ...
+    def nodes(self) -> np.ndarray: ...  # noqa: D102
 
     @property
-    def fingerprint(self) -> str:
-        """Short hash of everything that shapes the prediction (:func:`fingerprint_of`)."""
-        ...
+    def fingerprint(self) -> str: ...  # noqa: D102
 
     def __call__(self, theta: jax.Array) -> jax.Array:
         """Return the displacement (k, 3) mm at ``theta`` (p,)."""
@@ -68,65 +63,6 @@ class ForwardMap(Protocol):
     def at(self, nodes: np.ndarray) -> ForwardMap:
         """Return the map restricted to ``nodes``; a fast map then computes only those."""
         ...
-
-
-class SolvingMap(ABC):
-    """A forward map whose predictions are FEM solves, driven from Python or done by a cluster.
-
-    All other maps are compiled and differentiated by JAX.
-    """
-
-    @abstractmethod
-    def evaluate_all(self, thetas: jax.Array) -> Prediction:
-        """Return the predictions at many theta (c, p); fields gain a leading axis."""
-
-    @abstractmethod
-    def slopes_all(self, thetas: jax.Array) -> tuple[Prediction, jax.Array]:
-        """Return the predictions at many theta (c, p), and du/dtheta (c, p, k, 3)."""
-
-    @abstractmethod
-    def solved_by(self, execute: Executor) -> ForwardMap:
-        """Return the same map with its solves at many theta done by ``execute``."""
-
-
-_AT_ONCE = 64  # theta in one batch
-
-
-def evaluator(forward: ForwardMap) -> Callable[[jax.Array], Prediction]:
-    """Return the function from theta (c, p) to predictions; its first call compiles it."""
-    if isinstance(forward, SolvingMap):
-        return forward.evaluate_all
-    return jax.jit(lambda t: jax.lax.map(forward.evaluate, t, batch_size=_AT_ONCE))
-
-
-def evaluate_all(forward: ForwardMap, thetas: jax.Array) -> Prediction:
-    """Return the predictions at many theta (c, p); fields gain a leading axis."""
-    return evaluator(forward)(thetas)
-
-
-def require_answers(forward: ForwardMap, prediction: Prediction, what: str) -> None:
-    """Raise :class:`InputError` where a prediction is not valid; ``what`` begins the message."""
-    invalid = ~np.asarray(prediction.valid)
-    if invalid.any():
-        raise InputError(
-            f"{what}: {forward.label} has no answer at {invalid.sum()} of {len(invalid)} theta"
-        )
-
-
-def solved_by(forward: ForwardMap, execute: Executor) -> ForwardMap:
-    """Return ``forward`` with its solves at many theta done by ``execute``.
-
-    Raises
-    ------
-    InputError
-        A map that solves nothing.
-    """
-    if not isinstance(forward, SolvingMap):
-        raise InputError(
-            f"a {forward.kind} map solves no FEM, so a scheduler has no effect; take fem_forward, "
-            "or leave the scheduler out"
-        )
-    return forward.solved_by(execute)
 
 
 def fingerprint_of(*parts: str | np.ndarray | jax.Array) -> str:
@@ -152,39 +88,16 @@ def inside_only(forward: ForwardMap, theta: jax.Array) -> Prediction:
     return Prediction(forward(safe), inside)
 
 
-@dataclass(frozen=True, eq=False)
 class Extrapolated:
     """The map ``base`` without the limits of its box: valid wherever its displacement is finite.
 
     It measures how the error grows outside the box; a density must not use it.
     """
 
-    base: ForwardMap
-
-    @property
-    def kind(self) -> str:
-        """Kind of ``base``."""
-        return self.base.kind
-
-    @property
-    def label(self) -> str:
-        """Label of ``base``."""
-        return self.base.label
-
-    @property
-    def scene(self) -> Scene:
-        """The scene whose displacement ``base`` predicts."""
-        return self.base.scene
-
-    @property
-    def nodes(self) -> np.ndarray:
-        """Nodes at which it predicts, (k,)."""
-        return self.base.nodes
-
-    @property
-    def fingerprint(self) -> str:
-        """Short hash of ``base`` and of its use outside the box."""
-        return fingerprint_of("extrapolated", self.base.fingerprint)
+    def __init__(self, base: ForwardMap) -> None:
+        self.base, self.kind, self.label = base, base.kind, base.label
+        self.scene, self.nodes = base.scene, base.nodes
+        self.fingerprint = fingerprint_of("extrapolated", base.fingerprint)
 
     def __call__(self, theta: jax.Array) -> jax.Array:
         """Return the displacement (k, 3) mm."""
@@ -277,8 +190,8 @@ class ForwardKind:
     to_arrays, from_arrays : write and read the arrays of a map that is fitted while it is built,
         because a second fit may give another map; they are kept with results. ``from_arrays``
         raises ``KeyError`` where one is missing. ``None`` for a kind that is not fitted.
-    from_emulator : whether an emulator is one of its ingredients.
-    solves_fem : whether a prediction is a FEM solve, which workers of a cluster can do.
+    words : the further words that have an effect: ``emulator`` where one is an ingredient,
+        ``scheduler`` where a prediction is a FEM solve, which workers of a cluster can do.
     """
 
     name: str
@@ -287,5 +200,4 @@ class ForwardKind:
     options: tuple[Option, ...] = ()
     to_arrays: Callable[[ForwardMap], Arrays] | None = None
     from_arrays: Callable[[Scene, Arrays], ForwardMap] | None = None
-    from_emulator: bool = False
-    solves_fem: bool = False
+    words: tuple[str, ...] = ()

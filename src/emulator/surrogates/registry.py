@@ -41,10 +41,7 @@ def known_options() -> dict[str, tuple[Option, tuple[str, ...]]]:
 def full_options(name: str, options: Mapping[str, Any]) -> dict[str, int]:
     """Return a value of every option of the kind called ``name``, from ``options`` or by default.
 
-    Raises
-    ------
-    InputError
-        An unknown kind, an option it does not take, or a value out of range.
+    An option that it does not take is refused, and a value out of range.
     """
     kind = forward_kind(name)
     if not isinstance(options, Mapping):
@@ -59,18 +56,12 @@ def full_options(name: str, options: Mapping[str, Any]) -> dict[str, int]:
     return {o.name: o.checked(options.get(o.name, o.default)) for o in kind.options}
 
 
-def check_emulator(name: str, emulator: str | None) -> None:
-    """Refuse an emulator for a kind that is not built from one."""
-    if emulator is not None and not forward_kind(name).from_emulator:
-        owners = " or ".join(kind.name for kind in FORWARD_MAPS.values() if kind.from_emulator)
-        raise InputError(f"--emulator has no effect without --forward {owners}")
-
-
-def check_scheduler(name: str, scheduler: str | None) -> None:
-    """Refuse a scheduler for a kind whose predictions solve no FEM."""
-    if scheduler is not None and not forward_kind(name).solves_fem:
-        owners = " or ".join(kind.name for kind in FORWARD_MAPS.values() if kind.solves_fem)
-        raise InputError(f"--scheduler has no effect without --forward {owners}")
+def check_words(name: str, **words: str | None) -> None:
+    """Refuse an ``emulator`` or a ``scheduler`` that has no effect on the kind called ``name``."""
+    for word, value in words.items():
+        owners = [kind.name for kind in FORWARD_MAPS.values() if word in kind.words]
+        if value is not None and name not in owners:
+            raise InputError(f"--{word} has no effect without --forward {' or '.join(owners)}")
 
 
 def build_forward(
@@ -92,10 +83,7 @@ def restore_forward(
 ) -> ForwardMap:
     """Return the map that :func:`keep_forward` wrote, or a new one of a kind that writes none.
 
-    Raises
-    ------
-    InputError
-        The file is missing, damaged or of another kind.
+    A file that is missing, damaged or of another kind is refused.
     """
     kind = forward_kind(name)
     if kind.from_arrays is None:

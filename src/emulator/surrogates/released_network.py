@@ -19,8 +19,8 @@ from emulator.released.network import ReleasedNetwork, read_network
 from emulator.released.scenes import published_scene, published_tests, theta_units, units
 from emulator.scenes.scene import Scene
 from emulator.surrogates.emulator import Emulator
+from emulator.surrogates.network import Network
 from emulator.surrogates.network.graph import AugmentedGraph
-from emulator.surrogates.network.part import Network, Standardisation, filled
 from emulator.surrogates.network.pignn import Architecture
 
 _ARCHITECTURE = Architecture(edge_sum="receives")
@@ -66,16 +66,14 @@ def released_network(model: str, root: str | Path) -> Emulator:
             f"published data: theta of {model} has {len(released.mean)} means; expected {count}"
         )
     unit = theta_units(model)
-    basis = np.zeros((0, *scene.held.shape), dtype=np.float32)
     network = Network(
         architecture=_ARCHITECTURE,
-        parameters=count,
+        space=scene.space,
         graph=graph,
-        weights=filled(_ARCHITECTURE, graph, count, basis, _rename_weights(released, model)),
         scale=np.full(3, units(model).length),
-        basis=basis,
-        standardisation=Standardisation(scene.space, released.mean * unit, released.sd * unit),
-    )
+        basis=np.zeros((0, *scene.held.shape), dtype=np.float32),
+        theta={"mean": released.mean * unit, "sd": released.sd * unit},
+    ).filled(_rename_weights(released, model))
     emulator = Emulator(scene, network=network, record={"released": model})
     _check_energy(emulator, model, root)
     return emulator

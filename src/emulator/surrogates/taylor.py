@@ -82,13 +82,12 @@ class Expansion(ArrayPart):
 
         Added to the part, it has the same derivatives there as FEM.
         """
-        count = len(self.centre)
-        derivative = lambda x: part.coefficients(x)  # noqa: E731
-        known: dict[tuple[int, ...], jax.Array] = {(): part.coefficients(jnp.asarray(self.centre))}
+        derivative, centre = part.coefficients, jnp.asarray(self.centre)
+        known: Terms = {(): derivative(centre)}
         for degree in range(1, self.order + 1):
             derivative = jax.jacfwd(derivative)
-            tensor = jax.jit(derivative)(jnp.asarray(self.centre))
-            for term in combinations_with_replacement(range(count), degree):
+            tensor = jax.jit(derivative)(centre)
+            for term in combinations_with_replacement(range(len(centre)), degree):
                 known[term] = tensor[(slice(None), *term)]
         modes = jnp.asarray(part.modes)
         fields = [
@@ -103,7 +102,7 @@ class Expansion(ArrayPart):
 
     def rounded(self) -> Expansion:
         """Return the series rounded to float32, so that a file of half the size loses nothing."""
-        u, derivatives = (rounded(a) for a in (self.displacement, self.derivatives))
+        u, derivatives = rounded(self.displacement), rounded(self.derivatives)
         return replace(self, displacement=u, derivatives=derivatives)
 
 
@@ -153,7 +152,6 @@ def expand(
     SolverError
         No equilibrium was found at ``theta``, or it has no derivatives.
     """
-    _check_order(order)
     theta = simulator.scene.centre if theta is None else theta
     u = simulator.solve(theta).require_converged("the expansion's centre").displacement
     return expand_at(simulator, u, theta, order)
@@ -163,7 +161,8 @@ def expand_at(
     simulator: Simulator | Unloader, u: jax.Array, theta: jax.Array, order: int
 ) -> Expansion:
     """Return :func:`expand` about a known equilibrium ``u`` (n, 3) mm at ``theta`` (p,)."""
-    _check_order(order)
+    if order not in (1, 2, 3, 4):
+        raise InputError(f"expansion of order {order}; give 1 to 4")
     scene, theta, u = simulator.scene, jnp.asarray(theta, dtype=float), jnp.asarray(u, dtype=float)
     position = scene.to_unit(theta)
     chain = simulator.equations(u, theta)
@@ -188,11 +187,6 @@ def expand_at(
     indices = np.array([[*term, *(-1,) * (order - len(term))] for term in known[0]])
     total = sum(jnp.stack(list(each.values())) for each in known)
     return Expansion(np.asarray(position), u, indices, jnp.asarray(total))
-
-
-def _check_order(order: int) -> None:
-    if order not in (1, 2, 3, 4):
-        raise InputError(f"expansion of order {order}; give 1 to 4")
 
 
 def _forces(

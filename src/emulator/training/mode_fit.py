@@ -51,7 +51,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 from emulator.core.progress import counting
 from emulator.fem.campaign import Runs
 from emulator.scenes.scene import Scene
-from emulator.surrogates.network.part import Network
+from emulator.surrogates.network import Network
 from emulator.training.objectives import Scales
 from emulator.training.optimiser import Weights
 
@@ -149,7 +149,7 @@ class ModeFit:
     def _hidden(self, weights: Weights) -> jax.Array:
         """Return H (n, h): the trunk's last hidden layer and a column of ones."""
         network = nnx.merge(self.network.definition, weights)
-        H = network.decoder.features(network.processor(self.network.graph)).astype(float)
+        H = network.decoder.trunk.hidden(network.processor(self.network.graph)).astype(float)
         return jnp.concatenate([H, jnp.ones((len(H), 1))], axis=1)
 
     def _project(self, H: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -226,7 +226,7 @@ class ModeFit:
         decoder = nnx.merge(self.network.definition, weights).decoder
 
         def branch(position: jax.Array) -> jax.Array:
-            return decoder.coefficients(self.network.normalise(position))
+            return decoder.branch(self.network.normalise(position))
 
         x = self.scene.to_unit(self.runs.theta)
         value, slope = jax.vmap(lambda x: (branch(x), jax.jacfwd(branch)(x)))(x)

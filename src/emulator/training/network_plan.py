@@ -20,8 +20,8 @@ from emulator.core.errors import InputError
 from emulator.fem.campaign import Runs
 from emulator.fem.energy import require_rest
 from emulator.surrogates.emulator import Emulator
+from emulator.surrogates.network import fresh
 from emulator.surrogates.network.graph import augment, node_inputs
-from emulator.surrogates.network.part import fresh
 from emulator.surrogates.network.pignn import Architecture
 from emulator.surrogates.taylor import Expansion
 from emulator.training.checkpoint import Record, Session
@@ -132,7 +132,7 @@ def untrained(
 ) -> Emulator:
     """Return the emulator of ``series`` and of a network, with the weights of the start's, if any.
 
-    scale, basis : as in :class:`~emulator.surrogates.network.part.Network`.
+    scale, basis : as in :class:`~emulator.surrogates.network.Network`.
     """
     scene = job.scene
     network = fresh(scene, augment(scene), architecture, scale, plan.seed, basis)

@@ -17,7 +17,7 @@ from flax import nnx
 
 from emulator.core.errors import InputError, SolverError
 from emulator.core.progress import counting
-from emulator.surrogates.network.part import Network
+from emulator.surrogates.network import Network
 from emulator.training.checkpoint import Session, State
 
 WARMUP = 100  # steps in which the learning rate rises

@@ -11,7 +11,7 @@ from calibrate.certificate.estimates import jackknife, misfits, missed_by, momen
 from calibrate.certificate.pool import Pool
 from calibrate.certificate.predictive import Predictive, no_correction
 from calibrate.certificate.runs import Runs
-from calibrate.posterior.fit import Misfit
+from calibrate.posterior.diagnosis import Misfit
 from certificate_support import (
     NODES,
     exact_data,

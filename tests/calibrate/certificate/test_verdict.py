@@ -12,7 +12,7 @@ from calibrate.certificate.verdict import (
     Tail,
     judge,
 )
-from calibrate.posterior.fit import Misfit
+from calibrate.posterior.diagnosis import Misfit
 
 
 def changes(shift=0.0, error=0.01, log_sd=0.0, correlation=0.0):

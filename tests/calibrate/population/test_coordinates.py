@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from calibrate.population.coordinates import from_score, to_score
+from calibrate.population.model import from_score, to_score
 
 CASES = [(0.3, 0.2), (0.02, 0.1), (1.0, 0.05), (0.5, 3.0), (0.5, 0.01)]  # mean, sd on (0, 1)
 

@@ -8,8 +8,12 @@ from scipy import stats
 
 import calibrate as cal
 from calibrate.population import population_model
-from calibrate.population.coordinates import Information, information_of
-from calibrate.population.density import Conditions, density_of_population
+from calibrate.population.density import (
+    Conditions,
+    Information,
+    density_of_population,
+    information_of,
+)
 from linear_support import linear_forward
 
 LOW, HIGH = np.log(50.0), np.log(100.0)

@@ -10,9 +10,8 @@ DRAWS = {"mu": np.random.default_rng(0).normal(70.0, 2.0, size=(4, 500))}
 
 
 def said(statistics=None, row=None, attributes=None):
-    return diagnose(
-        DRAWS, statistics or {}, {"mu": {**GOOD["mu"], **(row or {})}}, attributes or {}
-    )
+    summary = {"mu": {**GOOD["mu"], **(row or {})}}
+    return list(diagnose(DRAWS, statistics or {}, summary, attributes or {}))
 
 
 def test_nothing_is_said_of_a_good_run():

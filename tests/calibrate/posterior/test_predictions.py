@@ -6,7 +6,7 @@ import pytest
 
 import calibrate as cal
 import emulator as em
-from calibrate.posterior.predictions import _programs, prior_replicates
+from calibrate.posterior.predictions import _over_draws, _prior, prior_replicates
 from certificate_support import exact_data, linear_model, posterior_of
 
 
@@ -18,7 +18,7 @@ def test_solved_data_are_the_traced_program_s(beam, simulator, states):
     model = cal.model(forward, observe, {"end": cal.GaussianNoise(sd=0.2)})
     key = jax.random.key(0)
     found = prior_replicates(model, key, 5)
-    draws, data, valid = _programs(model).prior(jax.random.split(key, 5))
+    draws, data, valid = _over_draws(_prior, model)((jax.random.split(key, 5),))
     assert np.asarray(valid).all()
     for name, values in found.draws.items():
         np.testing.assert_array_equal(values, draws[name])

@@ -216,6 +216,11 @@ def test_the_chart_shows_members_and_one_not_seen(result):
     assert (np.asarray(alone.y) < np.asarray(together.y)).all()
 
 
+def test_members_are_not_one_run(folder):
+    with pytest.raises(em.InputError, match="infer: Members is not one run; calibrate infer FILE"):
+        cal.infer(cal.read_experiment(folder / "beams.toml"))
+
+
 def test_folders_without_results_get_one_line(copy, tmp_path, capsys):
     said = complaint(capsys, "report", tmp_path / "none")
     assert "none/run.json does not exist: there is no such folder; give a folder that" in said

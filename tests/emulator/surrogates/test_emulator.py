@@ -15,8 +15,8 @@ from emulator.fem.campaign import run_campaign
 from emulator.surrogates import Architecture, Emulator, augment, load, save_emulator
 from emulator.surrogates.discrepancy import fit_discrepancy
 from emulator.surrogates.emulator import PARTS
+from emulator.surrogates.network import fresh
 from emulator.surrogates.network.graph import AugmentedGraph
-from emulator.surrogates.network.part import fresh
 from emulator.surrogates.polynomial import compressed, degrees_up_to
 from emulator.surrogates.taylor import expand
 from emulator.training.hybrid import mechanical_modes

@@ -22,9 +22,8 @@ from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
 from emulator.surrogates import Emulator, load, save_emulator
 from emulator.surrogates.network.family import on_body
-from emulator.surrogates.network.graph import AugmentedGraph
+from emulator.surrogates.network.graph import AugmentedGraph, describe
 from emulator.surrogates.network.pignn import Architecture, Processor
-from emulator.surrogates.network.ventricle_graph import describe
 from emulator.training import recipe, train
 from emulator.training.mechanics import Mechanics
 from emulator.training.plan import Job
@@ -98,16 +97,17 @@ def test_padding_changes_nothing(family: Emulator) -> None:
     body = runs(SHAPES[0])
     assert family.family is not None
     learned = family.family.learned
-    told = describe(body.scene)
+    described = describe(body.scene)
+    told = described.graph
     sizes = ventricles._Sizes(
-        told.real + 7, len(told.nodes) - told.real + 3, len(told.edges) + 5, 999
+        told.real + 7, len(told.node_features) - told.real + 3, len(told.senders) + 5, 999
     )
-    padded = ventricles._padded(body, told, learned.standard, sizes, np.random.default_rng(0))
+    padded = ventricles._padded(body, described, learned.standard, sizes, np.random.default_rng(0))
     part = on_body(learned, body.scene, strict=False)
     graph = AugmentedGraph(*padded[:4], real=sizes.real)
     modes, mean = part._module().prepare(graph, padded.vectors, padded.shares)
     own_modes, own_mean = part._prepare()
-    size = learned.scale * told.shape["size"]
+    size = learned.scale * described.shape["size"]
     # Edges were turned round, which a network not yet trained for long minds a little.
     assert np.allclose(mean, own_mean, atol=0.2)
     assert modes.shape[1] == told.real + 7

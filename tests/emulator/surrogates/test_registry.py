@@ -14,7 +14,7 @@ from emulator.surrogates.protocol import (
 from emulator.surrogates.registry import (
     FORWARD_MAPS,
     build_forward,
-    check_emulator,
+    check_words,
     full_options,
     keep_forward,
     known_options,
@@ -57,10 +57,10 @@ def test_an_option_of_two_kinds_names_both(monkeypatch):
 
 
 def test_an_emulator_is_refused_where_none_is_used():
-    check_emulator("emulator", "mine")
-    check_emulator("fem", None)
+    check_words("emulator", emulator="mine")
+    check_words("fem", emulator=None)
     with pytest.raises(InputError, match="--emulator has no effect without --forward emulator or"):
-        check_emulator("fem", "mine")
+        check_words("fem", emulator="mine")
 
 
 def test_every_kind_builds_a_map_with_its_name_and_its_own_fingerprint():

@@ -250,10 +250,10 @@ def sensitivity(arguments: Namespace) -> Answer:
     from calibrate.project.run import with_absolute_paths
     from emulator import Simulator
     from emulator.surrogates.protocol import Ingredients
-    from emulator.surrogates.registry import build_forward, check_scheduler, full_options
+    from emulator.surrogates.registry import build_forward, check_words, full_options
 
     check_seed(arguments.seed, "sensitivity")
-    check_scheduler(arguments.forward, arguments.scheduler)
+    check_words(arguments.forward, scheduler=arguments.scheduler)
     scheduler = words.scheduler_word(arguments)
     scene = words.scene_of(arguments)
     if arguments.out:

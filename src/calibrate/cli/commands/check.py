@@ -127,9 +127,9 @@ def _klotz(model: Model, seed: int) -> KlotzBand | None:
     from calibrate.measurements.klotz import klotz_of
     from calibrate.measurements.volume import pressure_volume
     from calibrate.posterior.klotz_band import klotz_band
-    from emulator.surrogates.protocol import SolvingMap
+    from emulator.surrogates.fem import FEMForward
 
-    if isinstance(model.forward, SolvingMap) or (curve := pressure_volume(model.full)) is None:
+    if isinstance(model.forward, FEMForward) or (curve := pressure_volume(model.full)) is None:
         return None
     if klotz_of(model.forward.scene, curve.rest, curve.pressures[-1]) is None:
         return None

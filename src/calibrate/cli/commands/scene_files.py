@@ -134,12 +134,15 @@ _WIDTH = 79
 @command(help="what is built in")
 def scenes(arguments: Namespace) -> Answer:  # noqa: ARG001
     """List the built-in scenes and the emulators shipped for them."""
+    from emulator.core.store import read_json
     from emulator.scenes import BUILT_IN
-    from emulator.surrogates.emulator import shipped_for
+    from emulator.surrogates.emulator import SHIPPED, shipped
 
+    origins = {name: read_json(SHIPPED / name / "emulator.json")["scene"] for name in shipped()}
     rows: list[dict[str, Any]] = []
     for name, make in sorted(BUILT_IN.items()):
         scene = make()
+        own = [emulator for emulator, origin in origins.items() if origin.get("scene") == name]
         rows.append(
             {
                 "name": name,
@@ -150,8 +153,8 @@ def scenes(arguments: Namespace) -> Answer:  # noqa: ARG001
                     {"name": p.name, "unit": p.unit, "low": p.low, "high": p.high, "scale": p.scale}
                     for p in scene.parameters
                 ],
-                "emulator_shipped": name in shipped_for(name),
-                "emulators": shipped_for(name),
+                "emulator_shipped": name in own,
+                "emulators": own,
             }
         )
     return Answer(rows, _scenes_in_words(rows))

@@ -3,7 +3,7 @@ r"""A network that has learned a family of ventricles, as a part of an emulator.
 .. math:: u(x) = \sum_v \Big[ s \sum_k c_k(x, g)\, \varphi_{kv}(z_i) \Big] V_{iv}
 
 with :math:`V_{iv}` the vectors of node i, mm, that turn with the body
-(:mod:`emulator.surrogates.network.ventricle_graph`), :math:`z_i` its state after the messages, and
+(:mod:`emulator.surrogates.network.graph`), :math:`z_i` its state after the messages, and
 :math:`g` the states' mean over the wall, so that coefficients depend on the whole body. The
 messages know no theta, so that on a body the part is a sum of modes like any other.
 """
@@ -25,10 +25,9 @@ from emulator.core.schema import read_as
 from emulator.core.store import inside, named_leaves
 from emulator.scenes.parameter_space import Parameter, ParameterSpace
 from emulator.scenes.scene import Scene
-from emulator.surrogates.network.graph import AugmentedGraph
-from emulator.surrogates.network.part import filled_state, standardised
+from emulator.surrogates.network import filled_state, standardised
+from emulator.surrogates.network.graph import AugmentedGraph, describe
 from emulator.surrogates.network.pignn import Architecture, Processor, branch, trunk
-from emulator.surrogates.network.ventricle_graph import BodyFeatures, describe
 from emulator.surrogates.part import CachedPart
 
 _SLACK = 1e-9  # round-off allowed, as a fraction of a parameter's range
@@ -39,18 +38,16 @@ VECTORS = 7
 
 
 class FamilyModule(nnx.Module):
-    """Processor, trunk and branch."""
+    """Processor, trunk and branch, with weights from a seed.
 
-    def __init__(
-        self,
-        architecture: Architecture,
-        node_width: int,
-        edge_width: int,
-        parameters: int,
-        rngs: nnx.Rngs,
-    ) -> None:
-        self.processor = Processor(architecture, node_width, edge_width, rngs)
-        parts = (parameters, 2 * architecture.latent)
+    widths : the numbers of features of a node and an edge, and of entries p of theta.
+    branch : normalised theta (..., p) and a body's mean state (2M,) to the coefficients (..., r).
+    """
+
+    def __init__(self, architecture: Architecture, widths: tuple[int, int, int], seed: int) -> None:
+        rngs = nnx.Rngs(seed)
+        self.processor = Processor(architecture, *widths[:2], rngs)
+        parts = (widths[2], 2 * architecture.latent)
         self.branch = branch(parts, architecture.modes, architecture, rngs)
         self.trunk = trunk(VECTORS, architecture, rngs)
 
@@ -66,17 +63,6 @@ class FamilyModule(nnx.Module):
         modes = jnp.einsum("nkv,nvi->kni", weights, vectors.astype(weights.dtype))
         return modes, shares.astype(states.dtype) @ states
 
-    def coefficients(self, theta: jax.Array, mean: jax.Array) -> jax.Array:
-        """Return coefficients (..., r) at normalised ``theta`` (..., p) and a body's mean state."""
-        return self.branch(theta, mean)
-
-
-def build_family(
-    architecture: Architecture, widths: tuple[int, int, int], seed: int
-) -> FamilyModule:
-    """Return a network with weights drawn from ``seed``; ``widths`` of nodes, edges and theta."""
-    return FamilyModule(architecture, *widths, nnx.Rngs(seed))
-
 
 class Standard(NamedTuple):
     """The means and standard deviations of the features over a family, each (d,) or (4,)."""
@@ -86,14 +72,16 @@ class Standard(NamedTuple):
     edge_mean: np.ndarray
     edge_sd: np.ndarray
 
-    def graph(self, body: BodyFeatures) -> AugmentedGraph:
-        """Return the graph of ``body``, features standardised."""
+    def of(self, graph: AugmentedGraph) -> AugmentedGraph:
+        """Return ``graph`` with its features standardised."""
+        nodes = (graph.node_features - self.node_mean) / self.node_sd
+        edges = (graph.edge_features - self.edge_mean) / self.edge_sd
         return AugmentedGraph(
-            node_features=((body.nodes - self.node_mean) / self.node_sd).astype(np.float32),
-            edge_features=((body.edges - self.edge_mean) / self.edge_sd).astype(np.float32),
-            senders=body.senders.astype(np.int32),
-            receivers=body.receivers.astype(np.int32),
-            real=body.real,
+            node_features=nodes.astype(np.float32),
+            edge_features=edges.astype(np.float32),
+            senders=graph.senders.astype(np.int32),
+            receivers=graph.receivers.astype(np.int32),
+            real=graph.real,
         )
 
 
@@ -122,6 +110,11 @@ class Learned(NamedTuple):
         standard = self.standard
         return len(standard.node_mean), len(standard.edge_mean), len(self.parameters)
 
+    @property
+    def outline(self) -> FamilyModule:
+        """The network with shapes in place of weights."""
+        return nnx.eval_shape(lambda: FamilyModule(self.architecture, self.widths, 0))
+
 
 @dataclass(frozen=True, eq=False)
 class FamilyNetwork:
@@ -142,7 +135,7 @@ class FamilyNetwork:
 
     @cached_property
     def _definition(self) -> nnx.GraphDef:
-        return nnx.split(_outline(self.learned))[0]
+        return nnx.split(self.learned.outline)[0]
 
     def _module(self) -> FamilyModule:
         return nnx.merge(self._definition, self.learned.weights)
@@ -165,7 +158,7 @@ class FamilyNetwork:
     def __call__(self, position: jax.Array) -> jax.Array:
         """Return the displacement (n, 3) mm at ``position`` (p,), processor included."""
         modes, mean = self._prepare()
-        coefficients = self._module().coefficients(self.normalise(position), mean)
+        coefficients = self._module().branch(self.normalise(position), mean)
         return jnp.tensordot(coefficients, modes, axes=1).astype(jnp.float64)
 
     def cache(self, nodes: np.ndarray) -> CachedPart:
@@ -207,18 +200,16 @@ class FamilyNetwork:
         cls, scene: Scene, description: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
     ) -> Self:
         """Return the part with this description and these arrays."""
-        architecture = read_as(Architecture, description["architecture"], "architecture")
-        standard = Standard(**inside(arrays, "standard"))
         learned = Learned(
-            architecture=architecture,
-            weights=nnx.state(nnx.Dict()),
-            standard=standard,
+            architecture=read_as(Architecture, description["architecture"], "architecture"),
+            weights=nnx.State({}),
+            standard=Standard(**inside(arrays, "standard")),
             scale=float(description["scale"]),
             parameters=tuple(Parameter(**each) for each in description["parameters"]),
             physics=description["physics"],
             shapes={name: (low, high) for name, (low, high) in description["shapes"].items()},
         )
-        weights = filled_state(_outline(learned), inside(arrays, "weights"), "the family's network")
+        weights = filled_state(learned.outline, inside(arrays, "weights"), "the family's network")
         learned = learned._replace(weights=weights)
         graph = AugmentedGraph(**inside(arrays, "graph"), real=len(scene.mesh.nodes))
         return cls(learned, scene.space, graph, arrays["vectors"], arrays["shares"])
@@ -239,7 +230,7 @@ def on_body(learned: Learned, scene: Scene, *, strict: bool = True) -> FamilyNet
     body = describe(scene)
     if strict:
         _check_shape(learned, scene, body.shape)
-    graph = learned.standard.graph(body)
+    graph = learned.standard.of(body.graph)
     # Rounded as in a file, so that a reloaded emulator makes equal predictions.
     vectors, shares = body.vectors.astype(np.float32), body.shares.astype(np.float32)
     return FamilyNetwork(learned, scene.space, graph, vectors, shares)
@@ -278,14 +269,8 @@ def _check_shape(learned: Learned, scene: Scene, shape: Mapping[str, float]) -> 
     for name, (low, high) in learned.shapes.items():
         slack = _BEYOND * (high - low)
         if not low - slack <= shape[name] <= high + slack:
-            hint = "; are its coordinates in mm?" if name == "size" else ""
-            unit = " mm" if name == "size" else ""
+            unit, hint = (" mm", "; are its coordinates in mm?") if name == "size" else ("", "")
             raise InputError(
                 f"scene '{scene.name}' is unlike the ventricles the network has seen: its {name} "
                 f"is {shape[name]:.3g}{unit}, theirs {low:.3g} to {high:.3g}{hint}"
             )
-
-
-def _outline(learned: Learned) -> FamilyModule:
-    """Return the network with shapes in place of weights."""
-    return nnx.eval_shape(lambda: build_family(learned.architecture, learned.widths, 0))

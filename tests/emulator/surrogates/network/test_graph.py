@@ -1,13 +1,12 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 import emulator as em
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.refinement import to_quadratic
 from emulator.scenes import Scene, Support
-from emulator.surrogates.network.graph import GraphOptions, augment, mesh_edges
+from emulator.surrogates.network.graph import augment, mesh_edges
 
 
 def test_real_edges_are_those_of_the_tetrahedra():
@@ -87,9 +86,6 @@ def test_moving_the_body_changes_nothing():
     np.testing.assert_allclose(here.edge_features, there.edge_features, atol=1e-5)
 
 
-@pytest.mark.parametrize("neighbours", [2, 6])
-def test_tiny_bodies_have_no_virtual_nodes(neighbours):
-    graph = augment(
-        em.scenes.once_clamped_beam(cells=(1, 1, 1), order=1), GraphOptions(neighbours=neighbours)
-    )
+def test_tiny_bodies_have_no_virtual_nodes():
+    graph = augment(em.scenes.once_clamped_beam(cells=(1, 1, 1), order=1))
     assert len(graph.node_features) == graph.real == 8

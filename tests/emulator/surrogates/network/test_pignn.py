@@ -9,9 +9,9 @@ from flax import nnx
 import emulator as em
 from emulator.core.errors import InputError
 from emulator.surrogates import Architecture, Emulator, augment
+from emulator.surrogates.network import fresh
 from emulator.surrogates.network.graph import AugmentedGraph
-from emulator.surrogates.network.part import fresh
-from emulator.surrogates.network.pignn import MLP, Processor, antisymmetric_sum, build
+from emulator.surrogates.network.pignn import MLP, PIGNN, Processor, antisymmetric_sum
 from emulator.surrogates.taylor import constant
 from network_support import SMALL, untrained
 
@@ -23,7 +23,7 @@ def emulator(beam):
 
 def test_the_published_sizes_have_the_published_number_of_weights():
     graph = augment(em.scenes.once_clamped_beam(order=1))
-    network = build(Architecture(), graph, parameters=2, fixed=0, seed=0)
+    network = PIGNN(Architecture(), graph, parameters=2, fixed=0, seed=0)
     count = sum(leaf.size for leaf in jax.tree.leaves(nnx.state(network)))
     assert count == pytest.approx(510_000, rel=0.005)
 

@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 from scipy.stats import chi2
 
-from calibrate.posterior.fit import SMALLEST_P, misfit_of, misfits
+from calibrate.posterior.diagnosis import SMALLEST_P, misfit_of, misfits
 
 
 def tree(data, sd=1.0, correlated=False):

@@ -1,4 +1,4 @@
-"""The answers that the explorer's page asks for, and its server on the loopback address."""
+"""A local page with a slider for every parameter: the body deforms live, by the cached emulator."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Explorer:
     @cached_property
     def page(self) -> bytes:
         """The page with its drawing library and the description of the scene."""
-        text = files("calibrate.explorer").joinpath("page.html").read_text(encoding="utf-8")
+        text = files("calibrate").joinpath("explorer.html").read_text(encoding="utf-8")
         about = json.dumps(self.about()).replace("</", "<\\/")
         return text.replace("{{plotly}}", get_plotlyjs()).replace("{{about}}", about).encode()
 
@@ -63,13 +63,7 @@ class Explorer:
         }
 
     def theta(self, position: Mapping[str, str]) -> jax.Array:
-        """Return theta (p,) from a position in [0, 1] of every parameter.
-
-        Raises
-        ------
-        InputError
-            A parameter that is missing, unknown, or not in the box.
-        """
+        """Return theta (p,) from a position in [0, 1] of every parameter, and of nothing else."""
         names = self.scene.parameter_names
         unknown = set(position) - set(names)
         if unknown:
@@ -178,34 +172,24 @@ class _Handler(Handler):
 
     def do_GET(self) -> None:
         """Answer with the page, or with what the page asks for."""
-        address = urlsplit(self.path)
+        address, explorer = urlsplit(self.path), self.server.subject
+        name = address.path.removeprefix("/")
         if self.is_foreign():
             self.send(403, b"this page is for this machine only\n", "text/plain")
-            return
-        if address.path == "/":
-            self.send(200, self.server.subject.page, "text/html; charset=utf-8")
-            return
-        name = address.path.removeprefix("/")
-        if name not in ("at", "curve", "error", "compare"):
+        elif not name:
+            self.send(200, explorer.page, "text/html; charset=utf-8")
+        elif name not in ("at", "curve", "error", "compare"):
             self.send(404, b"there are /, /at, /curve, /error and /compare\n", "text/plain")
-            return
-        try:
-            answer = getattr(self.server.subject, name)(dict(parse_qsl(address.query)))
-        except InputError as fault:
-            self.send(400, f"{fault}\n".encode(), "text/plain; charset=utf-8")
-            return
-        if isinstance(answer, bytes):
-            self.send(200, answer, "application/octet-stream")
         else:
-            self.send(200, json.dumps(answer).encode(), "application/json")
+            try:
+                found = getattr(explorer, name)(dict(parse_qsl(address.query)))
+            except InputError as fault:
+                self.send(400, f"{fault}\n".encode(), "text/plain; charset=utf-8")
+                return
+            plain = isinstance(found, bytes)
+            self.send(200, found, "application/octet-stream" if plain else "application/json")
 
 
 def serve(explorer: Explorer, port: int = 0) -> Server:
-    """Return a server on the loopback address, ready for ``serve_forever``; port 0 is a free one.
-
-    Raises
-    ------
-    InputError
-        A port that is taken, or none.
-    """
+    """Return a server on the loopback address, ready for ``serve_forever``; port 0 is any."""
     return listen(_Handler, explorer, port)
