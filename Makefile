@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 OUT ?= demo-output
 
 # Of studies: what is called and imported exists, and takes these arguments.
-LENIENT := $(addprefix --disable-error-code ,import-untyped import-not-found index misc operator union-attr arg-type type-var)
+LENIENT := --no-warn-unused-ignores $(addprefix --disable-error-code ,import-untyped import-not-found index misc operator union-attr arg-type type-var)
 
 # With the oldest libraries: what each of them is used for.
 OLDEST := .venv-oldest

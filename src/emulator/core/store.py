@@ -71,6 +71,8 @@ def to_json(content: Any) -> str:
 def _finite(content: Any) -> Any:
     if isinstance(content, Mapping):
         return {key: _finite(value) for key, value in content.items()}
+    if isinstance(content, np.ndarray):
+        content = content.tolist()
     if isinstance(content, list | tuple):
         return [_finite(value) for value in content]
     if isinstance(content, float) and not math.isfinite(content):

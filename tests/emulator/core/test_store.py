@@ -1,3 +1,5 @@
+import json
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from emulator.core.store import (
     read_arrays,
     replacing,
     save_arrays,
+    to_json,
     write_json,
 )
 
@@ -42,3 +45,8 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path):
         interrupted()
     assert '"old": 1' in path.read_text()
     assert [file.name for file in path.parent.iterdir()] == ["file.json"]
+
+
+def test_json_of_arrays_has_lists_and_null():
+    content = {"axis": np.array([0.0, np.nan, 1.0]), "size": (1, np.inf)}
+    assert json.loads(to_json(content)) == {"axis": [0.0, None, 1.0], "size": [1, None]}

@@ -297,7 +297,8 @@ def _write_indices(indices: xr.DataTree, scene: Scene, folder: Path) -> None:
         data = indices[FIELD].to_dataset()
         nodal = {
             f"{name} {label}": np.nan_to_num(values)
-            for name in {"first", "total", "mu_star", "bound_on_total"} & set(map(str, data))
+            for name in ("first", "total", "mu_star", "bound_on_total")
+            if name in data
             for label, values in zip(
                 data[data[name].dims[0]].values, data[name].values, strict=True
             )
