@@ -41,8 +41,8 @@ from emulator.scenes.loads import PublishedPressure
 from emulator.surrogates import Architecture, Emulator, load, save_emulator
 from emulator.surrogates.taylor import expand
 from emulator.training import recipe, train
-from emulator.training.box_sweeps import polynomial_part, sweep_box
 from emulator.training.modal import Modal
+from emulator.training.sweeps import polynomial_part, sweep_box
 
 HERE = Path(__file__).parent
 SEED = 0

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from emulator.core.display import counting
 from emulator.core.errors import InputError
-from emulator.core.progress import counting
 from emulator.scenes.scene import Scene
 from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.network.pignn import Architecture

@@ -20,7 +20,7 @@ from emulator.fem.unloading import scene_at_rest
 from emulator.geometry.generators.sphere import sphere_octant
 from emulator.mechanics.laws.neo_hookean import bulk_modulus
 from emulator.scenes import Scene
-from emulator.verify.sphere import INNER, MU, NU, OUTER, pressure_at, sphere_scene
+from emulator.verify.incompressible import INNER, MU, NU, OUTER, pressure_at, sphere_scene
 
 MET = 1e-8  # mm
 

@@ -23,8 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
+from emulator.core.display import counting
 from emulator.core.errors import InputError
-from emulator.core.progress import counting
 from emulator.scenes.scene import Scene
 from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.network import standardised

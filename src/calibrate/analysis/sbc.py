@@ -31,8 +31,8 @@ from calibrate.arviz import ecdf_utils
 from calibrate.posterior import predictions
 from calibrate.posterior.posterior import sample
 from calibrate.statistical_model import Model
+from emulator.core.display import counting
 from emulator.core.errors import InputError, check_seed
-from emulator.core.progress import counting
 from emulator.fem.campaign import executor, in_process
 from emulator.surrogates.fem import solved_by
 

@@ -41,8 +41,8 @@ from calibrate.samplers import SAMPLERS
 from calibrate.samplers.diagnostics import effective, normalised
 from calibrate.samplers.laplace import MISSED_AT, MISSED_BY
 from calibrate.statistical_model import FEMLikelihood
+from emulator.core.display import counting
 from emulator.core.errors import InputError
-from emulator.core.progress import counting
 from emulator.fem import Simulator
 from emulator.fem.campaign import executor
 

@@ -34,8 +34,8 @@ from calibrate.certificate.verdict import MeshChange
 from calibrate.measurements import Observations
 from calibrate.measurements.outputs import on_finer
 from emulator.accuracy.mesh_error import MeshError, MeshErrorEstimate, mesh_error
+from emulator.core.display import counting
 from emulator.core.errors import InputError, SolverError
-from emulator.core.progress import counting
 from emulator.fem import Simulator
 from emulator.fem.campaign import at_once, in_order
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from calibrate.posterior.diagnosis import SMALLEST_P, Misfit
 from calibrate.samplers.diagnostics import REFUSE_ABOVE_R_HAT, REFUSE_BELOW_ESS
-from emulator.core.representation import TableRepr
+from emulator.core.display import TableRepr
 
 Verdict = Literal["accepted", "reweight", "not certified", "undecided"]
 

@@ -61,7 +61,7 @@ def run_options(*more: str) -> Option:
 
 def _add_run(parser: ArgumentParser, more: Sequence[str]) -> None:
     from calibrate.project.run import Run
-    from emulator.core.docstrings import documented
+    from emulator.core.schema import documented
 
     add_scene(parser, "; or an experiment file, whose entries the options replace")
     parser.set_defaults(fields=(*MODEL, *more))

@@ -46,7 +46,7 @@ from jax.flatten_util import ravel_pytree
 
 from calibrate.noise.protocol import PLAUSIBLE
 from emulator.core.errors import InputError
-from emulator.core.small_matrices import eliminated
+from emulator.core.gaussian_process import eliminated
 from emulator.surrogates.protocol import fingerprint_of
 
 Means = Mapping[str, jax.Array]

@@ -54,7 +54,7 @@ from calibrate.population.model import (
 )
 from calibrate.samplers.density import Target, threads_for
 from calibrate.statistical_model import Data
-from emulator.core.small_matrices import eliminated
+from emulator.core.gaussian_process import eliminated
 
 
 class Information(NamedTuple):

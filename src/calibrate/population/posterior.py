@@ -19,8 +19,8 @@ from calibrate.posterior import predictions, read_tree
 from calibrate.posterior.diagnosis import diagnose, summary_of
 from calibrate.priors import Population, population_of_fits
 from calibrate.statistical_model import Model
+from emulator.core.display import TableRepr
 from emulator.core.errors import InputError, look_up
-from emulator.core.representation import TableRepr
 from emulator.core.store import write_netcdf
 
 ALONE, NEW, CORRELATION = "alone", "new_member", "correlation"

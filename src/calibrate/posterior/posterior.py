@@ -26,8 +26,8 @@ from calibrate.samplers.laplace import MISSED_BY, find_modes, missed_mode
 from calibrate.samplers.protocol import Context
 from calibrate.state_names import split
 from calibrate.statistical_model import Data, FEMLikelihood, Model
+from emulator.core.display import TableRepr
 from emulator.core.errors import InputError, check_known
-from emulator.core.representation import TableRepr
 from emulator.core.store import write_netcdf
 from emulator.fem import Simulator
 

@@ -13,8 +13,8 @@ import xarray as xr
 import zarr
 
 from calibrate.provenance import versions
+from emulator.core.display import counting
 from emulator.core.errors import InputError, look_up
-from emulator.core.progress import counting
 from emulator.fem import NewtonOptions, Simulator
 from emulator.fem.campaign import Neighbours, Solver, executor, solve_rows
 from emulator.fem.campaign.designs import DESIGNS

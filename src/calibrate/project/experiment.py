@@ -52,11 +52,10 @@ from calibrate.project.results import MEMBERS
 from calibrate.project.run import SYNTHETIC, Run, with_absolute_paths
 from calibrate.samplers import SAMPLERS
 from emulator.core import schema
-from emulator.core.docstrings import documented
 from emulator.core.errors import InputError
 from emulator.core.gaussian_process import CORRELATIONS
 from emulator.core.line_index import toml_lines
-from emulator.core.schema import OneOf, Table, json_schema, table_of
+from emulator.core.schema import OneOf, Table, documented, json_schema, table_of
 from emulator.surrogates.registry import FORWARD_MAPS, forward_kind, known_options
 
 _OF_A_MEMBER = ("data", "truth", "known", "observe")

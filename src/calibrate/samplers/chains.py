@@ -37,8 +37,8 @@ from calibrate.samplers.transport import (
     fit_standard,
     standard_identity,
 )
+from emulator.core.display import counting
 from emulator.core.errors import SolverError
-from emulator.core.progress import counting
 
 _CHUNK = 50  # iterations between two updates of the progress bar
 _CANDIDATES = 16  # starting points tried, for forward maps that are not valid everywhere

@@ -36,8 +36,8 @@ from calibrate.samplers.density import Density, tempered
 from calibrate.samplers.nuts import BLACKJAX_NUTS, BlackJAXNUTSOptions
 from calibrate.samplers.protocol import ChainOptions, Context, Draws, Sampler
 from calibrate.statistical_model import Data
+from emulator.core.display import counting
 from emulator.core.errors import InputError, SolverError
-from emulator.core.progress import counting
 
 
 @dataclass(frozen=True)

@@ -32,8 +32,8 @@ from jax.scipy.special import logsumexp
 from calibrate.samplers.density import Density
 from calibrate.samplers.protocol import Context, Draws, Options, Sampler
 from calibrate.statistical_model import Data
+from emulator.core.display import counting
 from emulator.core.errors import SolverError
-from emulator.core.progress import counting
 
 # Log likelihood of particles where the forward map has no answer. Finite, because its product with
 # a temperature of 0 must be 0; so low that such particles die out at the first step.

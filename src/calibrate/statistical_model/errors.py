@@ -41,8 +41,8 @@ from calibrate.noise import information_about_means
 from calibrate.statistical_model.fem_likelihood import FEMLikelihood
 from calibrate.statistical_model.model import Model
 from emulator.accuracy.mesh_error import mesh_error
+from emulator.core.display import counting
 from emulator.core.errors import InputError, SolverError
-from emulator.core.progress import counting
 from emulator.fem import Simulator
 
 FEWEST = 8  # FEM runs from which an error is learned

@@ -6,7 +6,9 @@ found and what would be right. Numbers are finite, and neither strings nor boole
 
 from __future__ import annotations
 
+import inspect
 import json
+import re
 import types
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -20,10 +22,32 @@ import pydantic
 from pydantic import BaseModel, ValidationError
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, core_schema
 
-from emulator.core.docstrings import documented, summary
 from emulator.core.errors import InputError, closest, look_up
 from emulator.core.line_index import Path, json_lines, line_of
 from emulator.core.store import read_json
+
+# ``names : text``, with its further lines indented; under a heading of its section or without one.
+_ENTRY = re.compile(r"^(\w[\w, ]*?) : (.*?)(?=^\S|^\s*$|\Z)", re.MULTILINE | re.DOTALL)
+
+
+def summary(kind: type) -> str:
+    """Return the first sentence of a docstring, on one line and without markup."""
+    return _plain((kind.__doc__ or "").split("\n\n")[0])
+
+
+def documented(kind: type) -> dict[str, str]:
+    """Return the text of each parameter in the docstrings of a class and its bases, by name."""
+    texts: dict[str, str] = {}
+    for base in reversed(kind.__mro__):
+        for names, text in _ENTRY.findall(inspect.cleandoc(base.__doc__ or "")):
+            texts |= dict.fromkeys(names.split(", "), _plain(text))
+    return texts
+
+
+def _plain(text: str) -> str:
+    text = re.sub(r":\w+:`~?([^`]*)`", r"\1", " ".join(text.split()))
+    return text.replace("``", "").strip()
+
 
 _SCALARS = {float: "number", int: "whole number", str: "string"}
 # Pydantic's codes of a wrong type, where no field of a table has an expectation.

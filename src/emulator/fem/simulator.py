@@ -19,9 +19,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.core.display import TableRepr
 from emulator.core.errors import InputError
 from emulator.core.machine import require_cpu, require_float64
-from emulator.core.representation import TableRepr
 from emulator.fem.assembly import System
 from emulator.fem.compiled import scan
 from emulator.fem.derivatives import (

@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.core.display import TableRepr
 from emulator.core.errors import InputError
-from emulator.core.representation import TableRepr
 from emulator.geometry.discretisation import (
     Blocks,
     Discretisation,

@@ -28,8 +28,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.catalogue import scene_from_origin
+from emulator.core.display import TableRepr
 from emulator.core.errors import InputError, look_up
-from emulator.core.representation import TableRepr
 from emulator.core.store import inside, read_arrays, read_json, save_arrays, write_json
 from emulator.scenes.scene import Scene, all_nodes, check_nodes
 from emulator.surrogates.coarse import Coarse

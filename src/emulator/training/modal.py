@@ -20,7 +20,6 @@ from emulator.fem.campaign.designs import design
 from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.network.pignn import Architecture
 from emulator.surrogates.taylor import constant
-from emulator.training.box_sweeps import check_sweeps, runs_of, sweep_box
 from emulator.training.checkpoint import Record, Session
 from emulator.training.mechanics import FEM_SHARE
 from emulator.training.mode_fit import ModeFit
@@ -28,6 +27,7 @@ from emulator.training.network_plan import NetworkPlan, Problem, architecture_of
 from emulator.training.objectives import loss_scales
 from emulator.training.optimiser import NetworkTraining, orthogonal_steps, two_cosines
 from emulator.training.plan import Job, check_runs
+from emulator.training.sweeps import check_sweeps, runs_of, sweep_box
 
 ARCHITECTURE = Architecture(
     steps=3,

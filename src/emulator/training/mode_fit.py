@@ -48,7 +48,7 @@ import scipy.sparse as sp
 from flax import nnx
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from emulator.core.progress import counting
+from emulator.core.display import counting
 from emulator.fem.campaign import Runs
 from emulator.scenes.scene import Scene
 from emulator.surrogates.network import Network

@@ -15,8 +15,8 @@ import optax
 import optax.contrib
 from flax import nnx
 
+from emulator.core.display import counting
 from emulator.core.errors import InputError, SolverError
-from emulator.core.progress import counting
 from emulator.surrogates.network import Network
 from emulator.training.checkpoint import Session, State
 

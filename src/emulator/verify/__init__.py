@@ -9,11 +9,10 @@ from emulator.verify.consistency import (
     verify_invariance,
     verify_patch,
 )
-from emulator.verify.cook import verify_cook
 from emulator.verify.homogeneous import verify_homogeneous
+from emulator.verify.incompressible import verify_cook, verify_sphere
 from emulator.verify.land import verify_beam, verify_contraction, verify_ventricle
 from emulator.verify.released import verify_published
-from emulator.verify.sphere import verify_sphere
 
 __all__ = ["CASES", "Benchmark", "verify_published"]
 

@@ -11,7 +11,7 @@ from calibrate.certificate.predictive import Predictive
 from calibrate.certificate.runs import Solver, descend
 from calibrate.statistical_model import FEMLikelihood
 from certificate_support import grid_of, linear_model, posterior_of
-from emulator.core.progress import counting
+from emulator.core.display import counting
 from linear_support import LinearForward, LinearSimulator, Step, linear_forward
 
 APART = 12.0  # kPa from the plane mu = 75 to each of two modes

@@ -1,6 +1,6 @@
 """What is read of docstrings."""
 
-from emulator.core.docstrings import documented, summary
+from emulator.core.schema import documented, summary
 
 
 class Ball:

@@ -3,7 +3,7 @@
 import html
 
 import emulator as em
-from emulator.core.representation import TableRepr
+from emulator.core.display import TableRepr
 
 
 def test_a_scene_and_what_is_made_of_it(beam, simulator):

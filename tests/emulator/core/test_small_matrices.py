@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from emulator.core.small_matrices import eliminated
+from emulator.core.gaussian_process import eliminated
 
 
 def test_elimination_is_the_inverse_and_the_determinant():

@@ -32,7 +32,7 @@ from emulator.scenes.effects import effects_of
 from emulator.scenes.finer import finer
 from emulator.scenes.loads import Gravity
 from emulator.scenes.supports import Support
-from emulator.verify.cook import deflection, membrane
+from emulator.verify.incompressible import deflection, membrane
 from scene_support import block
 
 

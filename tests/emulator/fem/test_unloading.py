@@ -13,7 +13,7 @@ from emulator.fem.solution import Status
 from emulator.geometry.generators.sphere import sphere_octant
 from emulator.mechanics.laws.neo_hookean import bulk_modulus
 from emulator.scenes.loads import KPA_PER_MMHG, Force
-from emulator.verify.sphere import INNER, MU, OUTER, pressure_at, sphere_scene
+from emulator.verify.incompressible import INNER, MU, OUTER, pressure_at, sphere_scene
 from scene_support import between_plates, block
 
 MET = 1e-8  # mm

@@ -13,10 +13,10 @@ from emulator.fem import simulator as fem_simulator
 from emulator.fem import sobol
 from emulator.surrogates import load, save_emulator
 from emulator.surrogates.network.pignn import Architecture
-from emulator.training import box_sweeps as module
 from emulator.training import recipe, train
-from emulator.training.box_sweeps import runs_of, sweep_box
+from emulator.training import sweeps as module
 from emulator.training.checkpoint import CHECKPOINT, SWEEPS
+from emulator.training.sweeps import runs_of, sweep_box
 from emulator.training.targets import targets
 
 SMALL = Architecture(

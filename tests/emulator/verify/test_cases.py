@@ -16,10 +16,17 @@ from emulator.verify.consistency import (
     verify_invariance,
     verify_patch,
 )
-from emulator.verify.cook import deflection, membrane
+from emulator.verify.incompressible import (
+    INNER,
+    OUTER,
+    deflection,
+    inner_stretch,
+    membrane,
+    pressure_at,
+    sphere_scene,
+)
+from emulator.verify.incompressible import MU as SHEAR
 from emulator.verify.land import apexes, beam, contraction, fibres
-from emulator.verify.sphere import INNER, OUTER, inner_stretch, pressure_at, sphere_scene
-from emulator.verify.sphere import MU as SHEAR
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.core.progress import counting
+from emulator.core.display import counting
 from emulator.fem.campaign.workers import Executor, Row, Solver, Task, in_process
 from emulator.fem.simulator import Simulator
 from emulator.fem.solution import Solution

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.core.display import counting
 from emulator.core.errors import InputError
-from emulator.core.progress import counting
 from emulator.fem.campaign.campaign import Field, Neighbours, run_campaign, solve_rows
 from emulator.fem.campaign.workers import Solver
 from emulator.fem.simulator import Simulator

@@ -1,8 +1,9 @@
-"""Shared by the generators: named surfaces, and triangulations extruded into tetrahedra."""
+"""What generators share: default sizes, named surfaces, triangulations extruded to tetrahedra."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -55,3 +56,24 @@ def extrude(columns: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 def stacked(vertices: int, layers: int) -> np.ndarray:
     """Return columns (vertices, layers + 1) of nodes numbered layer by layer."""
     return np.arange(vertices * (layers + 1)).reshape(layers + 1, vertices).T
+
+
+def resolved(sizes: Mapping[int, Mapping[str, Any]], order: int, **chosen: Any) -> dict[str, Any]:
+    """Return sizes by name, and ``order``, with defaults in place of None.
+
+    Quadratic elements, the default, are accurate with fewer nodes (``studies/elements``); published
+    models have linear ones.
+
+    Parameters
+    ----------
+    sizes : default sizes by the order of the elements, 1 and 2.
+    order : order of the elements.
+    chosen : the sizes by name, None for the default.
+    """
+    if order not in sizes:
+        raise InputError(f"order {order} of the elements; expected 1 (linear) or 2 (quadratic)")
+    defaults = sizes[order]
+    return {
+        **{name: defaults[name] if value is None else value for name, value in chosen.items()},
+        "order": order,
+    }

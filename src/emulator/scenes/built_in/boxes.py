@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from emulator.geometry.generators.body import resolved
 from emulator.geometry.generators.box import box, toward_ends
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws import find_law
-from emulator.scenes.built_in.resolution import resolved
 from emulator.scenes.built_in.ventricles import MYOCARDIUM
 from emulator.scenes.loads import Gravity, GravityVector, Traction
 from emulator.scenes.parameter_space import Parameter

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from emulator.geometry.generators.body import resolved
 from emulator.geometry.generators.organ import organ
 from emulator.mechanics.laws import find_law
-from emulator.scenes.built_in.resolution import resolved
 from emulator.scenes.loads import Gravity
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene

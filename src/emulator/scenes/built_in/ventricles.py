@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import astuple, replace
 
 from emulator.geometry import generators
+from emulator.geometry.generators.body import resolved
 from emulator.geometry.generators.ellipsoid import (
     HUMAN,
     EllipsoidalWall,
@@ -13,7 +14,6 @@ from emulator.geometry.generators.ellipsoid import (
 )
 from emulator.geometry.heart_wall import SEGMENTS, aha_segments
 from emulator.mechanics.laws import find_law
-from emulator.scenes.built_in.resolution import resolved
 from emulator.scenes.fibre_rules import Biventricle, Helix
 from emulator.scenes.loads import KPA_PER_MMHG, CavityPressure
 from emulator.scenes.parameter_space import Parameter

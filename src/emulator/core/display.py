@@ -1,11 +1,14 @@
-"""Progress of long work: a bar on a terminal, elsewhere a line now and then.
+"""What a person sees of work and of results: bars of progress, and tables for ``repr``.
 
-A bar is drawn over itself, and a log file would keep every one of its states.
+A bar is drawn over itself on a terminal. Elsewhere a line is written now and then: a log file would
+keep every one of a bar's states.
 """
 
 from __future__ import annotations
 
 import sys
+from abc import abstractmethod
+from html import escape
 from typing import Any
 
 from tqdm import tqdm
@@ -48,3 +51,26 @@ class Lines(tqdm):
 def counting(*arguments: Any, **options: Any) -> tqdm:
     """Return tqdm's bar where standard error is a terminal, else :class:`Lines`."""
     return (tqdm if sys.stderr.isatty() else Lines)(*arguments, **options)
+
+
+class TableRepr:
+    """An object that is represented by a title and a few named rows."""
+
+    @abstractmethod
+    def summary_rows(self) -> tuple[str, list[tuple[str, str]]]:
+        """Return the title, and the rows as pairs of a name and its text."""
+
+    def __repr__(self) -> str:
+        """Return the title and all rows on one line."""
+        title, rows = self.summary_rows()
+        return f"<{title}: {'; '.join(f'{name} {value}' for name, value in rows)}>"
+
+    def _repr_html_(self) -> str:
+        """Return the title and all rows as an HTML table, which notebooks show."""
+        title, rows = self.summary_rows()
+        body = "".join(
+            f'<tr><td style="text-align:left"><b>{escape(name)}</b></td>'
+            f'<td style="text-align:left">{escape(value)}</td></tr>'
+            for name, value in rows
+        )
+        return f"<table><caption>{escape(title)}</caption>{body}</table>"

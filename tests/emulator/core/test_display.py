@@ -4,7 +4,7 @@ import io
 
 import pytest
 
-from emulator.core import progress
+from emulator.core import display
 
 
 @pytest.fixture
@@ -17,7 +17,7 @@ def clock(monkeypatch):
 
 def lines(clock, each, count, **options):
     said = io.StringIO()
-    with progress.Lines(total=count, desc="FEM", unit="run", file=said, **options) as bar:
+    with display.Lines(total=count, desc="FEM", unit="run", file=said, **options) as bar:
         for _ in range(count):
             clock[0] += each
             bar.update()
@@ -40,7 +40,7 @@ def test_short_work_and_what_is_disabled_say_nothing(clock):
 
 def test_an_iterable_and_a_postfix(clock):
     said = io.StringIO()
-    bar = progress.Lines(range(3), file=said)
+    bar = display.Lines(range(3), file=said)
     for k in bar:
         clock[0] += 20.0
         bar.set_postfix(loss=f"{k}")
