@@ -74,7 +74,9 @@ def test_a_mode_between_walls_is_refused(beam):
     observe = cal.nodal_displacements(beam, [3])
     model = cal.model(forward, observe, cal.GaussianNoise(sd=0.001), prior, check_scale=False)
     truth = np.asarray(replace(forward, limit=np.inf).at(observe.nodes)(jnp.array([79.0, 79.0])))
-    with pytest.raises(SolverError, match="the optimiser stopped .* sd from a mode"):
+    # Round-off decides where the optimiser stops at the wall, and so which of the two is said.
+    said = "the optimiser stopped .* sd from a mode|no curvature at its mode"
+    with pytest.raises(SolverError, match=said):
         cal.sample(model, truth, sampler="laplace")
 
 
