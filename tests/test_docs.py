@@ -1,5 +1,6 @@
 """The documentation: every public name is on it, and it builds without a warning."""
 
+import ast
 import inspect
 import re
 import subprocess
@@ -61,9 +62,7 @@ def test_docs_and_notebooks_import_from_the_two_packages_only():
     pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
     code = {}
     for path in pages:
-        blocks = re.findall(
-            r"```python\n(.*?)```", path.read_text(encoding="utf-8"), flags=re.DOTALL
-        )
+        blocks = examples(path.relative_to(ROOT))
         code[path.name] = "\n".join(block for block in blocks if not block.startswith('"""'))
     for path in (ROOT / "notebooks").glob("*.py"):
         code[path.name] = path.read_text(encoding="utf-8")
@@ -83,13 +82,64 @@ def test_the_readme_is_short():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 120
 
 
-def run_examples(page):
+OWN_TESTS = {"README.md", "docs/extending.md", "docs/ecosystem.md"}
+"""Pages whose examples other tests run."""
+PAGES = sorted(
+    page
+    for path in (ROOT / "docs").glob("*.md")
+    if "```python\n" in path.read_text(encoding="utf-8")
+    and (page := f"docs/{path.name}") not in OWN_TESTS
+)
+NEED_MORE = {"mesh_wall", "released_network"}
+"""Functions that need Gmsh, or released data: examples of them have no language."""
+
+
+def examples(page, *, slow=True):
+    """Python examples of a page; one that takes long is marked ``python slow``."""
+    mark = "(?: slow)?" if slow else ""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    return re.findall(rf"```python{mark}\n(.*?)```", text, flags=re.DOTALL)
+
+
+def run_examples(page, *, slow=True):
     """Run the Python examples of a page one after the other; return what they define."""
     names = {}
-    text = (ROOT / page).read_text(encoding="utf-8")
-    for code in re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL):
-        exec(compile(code, page, "exec"), names)
+    for number, code in enumerate(examples(page, slow=slow), 1):
+        exec(compile(code, f"{page}, example {number}", "exec"), names)
     return names
+
+
+def public_names(code):
+    """Names of both packages that some code uses."""
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.Attribute) and ast.unparse(node.value) in ("em", "cal"):
+            yield node.attr
+        elif isinstance(node, ast.ImportFrom):
+            yield from (alias.name for alias in node.names)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_the_quick_examples_run(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    run_examples(page, slow=False)
+
+
+def test_every_public_name_is_in_an_example_that_runs():
+    code = "\n".join(
+        example for page in (*PAGES, "docs/extending.md") for example in examples(page, slow=False)
+    )
+    missing = {*emulator.__all__, *calibrate.__all__} - set(public_names(code))
+    assert missing == NEED_MORE
+    text = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs").glob("*.md"))
+    assert [name for name in missing if not re.search(rf"\b(em|cal)\.{name}\b", text)] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", ["docs/load_states.md", "docs/unloading.md"])
+def test_the_examples_that_take_long_run(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run_examples(page)
 
 
 @pytest.mark.slow
@@ -105,13 +155,15 @@ def test_the_example_of_several_observations_runs(capsys):
 
 
 @pytest.mark.slow
-def test_the_quick_start_runs(capsys):
+def test_the_quick_start_runs(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     run_examples("docs/quickstart.md")
     assert "accepted" in capsys.readouterr().out
 
 
 @pytest.mark.slow
-def test_the_examples_of_populations_run():
+def test_the_examples_of_populations_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     names = run_examples("docs/populations.md")
     assert names["solution"].converged
     found = names["found"]
