@@ -91,7 +91,7 @@ PAGES = sorted(
     and (page := f"docs/{path.name}") not in OWN_TESTS
 )
 NEED_MORE = {"mesh_wall", "released_network"}
-"""Functions that need Gmsh, or released data: examples of them have no language."""
+"""Functions that need Gmsh or released data; pages show a call that does not run here."""
 
 
 def examples(page, *, slow=True):
