@@ -23,7 +23,7 @@ for package in (emulator, calibrate):
         try:
             importlib.import_module(module.name)
         except ModuleNotFoundError as error:  # of the extra "plot"
-            assert error.name in ("plotly", "matplotlib"), error
+            assert error.name in ("plotly", "matplotlib", "jinja2", "markupsafe"), error
         except emulator.core.errors.InputError as error:  # of another extra, which it names
             assert "pip install 'soft-tissue-calibrate[" in str(error), error
 from emulator.surrogates.emulator import shipped
