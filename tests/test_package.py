@@ -10,6 +10,7 @@ import pytest
 
 import calibrate
 import emulator
+from emulator.core.errors import InputError
 
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted((ROOT / "src").rglob("*.py"))
@@ -91,3 +92,11 @@ def test_versions_agree():
     text = (ROOT / "pyproject.toml").read_text()
     assert f'version = "{emulator.__version__}"' in text
     assert f"version: {emulator.__version__}" in (ROOT / "CITATION.cff").read_text()
+
+
+def test_a_report_without_its_extra_is_refused_in_one_line(monkeypatch, tmp_path):
+    for name in [m for m in sys.modules if m.startswith("calibrate.report.")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "markupsafe", None)
+    with pytest.raises(InputError, match=r"a report needs markupsafe: pip install .*\[plot\]"):
+        calibrate.write_report(tmp_path)

@@ -27,23 +27,8 @@ from emulator.core.store import read_json, replacing
 _SHIFTS = {"FEM": "by FEM / sd", "mesh": "on a finer mesh / sd"}
 
 
-def write_report(folder: str | Path, out: str | Path | None = None, *, fem: bool = True) -> Path:
-    """Write one HTML file about a posterior or a population.
-
-    Parameters
-    ----------
-    folder : the folder that :func:`calibrate.project.infer` wrote, or that of a population
-        (:func:`calibrate.project.members.infer_members`).
-    out : the file to write, ``folder/report.html`` by default.
-    fem : whether to solve once at the posterior's mean, to show the map's error on the body;
-        nothing is solved for a population.
-
-    Raises
-    ------
-    InputError
-        ``folder`` holds neither a posterior nor a population, or the posterior of another run or
-        map.
-    """
+def write_page(folder: str | Path, out: str | Path | None, *, fem: bool) -> Path:
+    """Write the page; see :func:`calibrate.report.write_report`."""
     folder = Path(folder)
     target = folder / REPORT if out is None else Path(out)
     if holds_population(folder):
