@@ -48,10 +48,9 @@ Before data, a size that is inferred is integrated over its prior, with distribu
 .. math:: p(y \mid x) = \frac1K \sum_{k=1}^K N\left(y;\, g(x),\, S_r(\alpha_k)\right), \qquad
           \alpha_k = \Phi^{-1}\left(\tfrac{k - 1/2}{K}\right).
 
-Where the size of one is inferred, each
-data set has another quantile of its prior, and F is that of x at this size: about x and
-the size together Gaussian data has no information in common, so that not to know
-the size widens x in second order only.
+If the size of an error is inferred, each data set takes another quantile of the size's prior, and F
+is the information about x at that size. Gaussian data has no information about x and the size in
+common, so that an unknown size widens x in second order only.
 
 **Next measurement.** A candidate :math:`y' = g'(x) + \varepsilon'` with the information F' about x
 would add to the present posterior, of covariance C,

@@ -217,7 +217,7 @@ def _analysed(
 def _by_variance(factors: Factors, outputs: np.ndarray, seed: int) -> dict[str, Any]:
     shape = len(factors.labels), outputs.shape[1]
     block = outputs.reshape(-1, shape[0] + 2, shape[1])
-    # Of the two independent samples of the design.
+    # The variance is that of the design's two independent samples.
     variance = np.concatenate([block[:, 0], block[:, -1]]).var(axis=0)
     results = {
         # SALib takes the seed 0 for none.

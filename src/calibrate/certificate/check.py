@@ -127,7 +127,7 @@ def examine(
         around = solver(surroundings)
         prior = predictive.prior_draws(key_from(rng), max(round(_AT_PRIOR * count), 4))
         at_prior = solver(prior, slopes=True)
-        # Where the map hides a mode altogether, only FEM leads to it.
+        # Only descents of FEM's own misfit lead to a mode that the map hides altogether.
         descending = max(round(_DESCENTS * count), min(_FEWEST_DESCENTS, count // 6))
         descents, modes = descend(solver, at_prior, at_draws, z, descending, rng)
         training, total = Runs.joined([at_draws, around, at_prior, descents]), count

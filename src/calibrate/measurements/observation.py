@@ -72,7 +72,7 @@ dimensions of each array, by the array's name; the values of each dimension."""
 class Observation(ABC):
     """Measured numbers as a function of the displacement of a few nodes, and of theta.
 
-    What is here is one number, in a column called as on the command line,
+    This class is an observation of one number; its column is called as on the command line,
     ``kind:argument:argument``. A kind is a frozen dataclass that declares
 
     kind : its name in the registry, in JSON and on the command line.

@@ -167,7 +167,7 @@ def mesh_errors(
     rows = {}
     for name, part in coarse.parts.items():
         both = (values[name], values[name] - finer[name])
-        # Of one number as it is, of several the root mean square.
+        # One number is taken as it is; several give their root mean square.
         size, difference = (float(np.sqrt(np.mean(v**2)) if np.ndim(v) else v) for v in both)
         rows[name] = {
             "unit": part.unit,

@@ -1,6 +1,6 @@
 r"""The draws in a few numbers, and what is wrong with a run or with its data, in words.
 
-Whether data could have come from the model is told by data simulated from draws of the posterior.
+Data simulated from draws of the posterior tell whether the data could have come from the model.
 Distances of simulated and measured data from a prediction say how much of the one is as far off as
 the other: posterior predictive p-values :math:`P(T(y^\text{rep}) \ge T(y))` (Gelman, Meng and Stern
 1996) of the data as a whole, :math:`T_1`, and of its worst datum, :math:`T_2`. From the replicates

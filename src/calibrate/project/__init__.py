@@ -1,4 +1,4 @@
-"""From a run to its report: a :class:`Run` is read, modelled, sampled, saved and certified.
+"""A :class:`Run` is read, modelled, sampled, saved, certified and reported here.
 
 What it exports is listed in ``__init__.pyi`` and imported when first used.
 """

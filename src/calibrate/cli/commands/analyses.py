@@ -187,7 +187,7 @@ def _effects_in_words(recommendation: Recommendation) -> str:
 
 
 _SAMPLES = {"sobol": 512, "morris": 64, "derivatives": 256}
-# By method: the heads of a table's columns, and what is in them; blanks keep heads apart.
+# The heads of a table's columns, and their contents, by method; blanks keep heads apart.
 _COLUMNS = {
     "sobol": {
         "first": "first_together",
