@@ -54,7 +54,6 @@ from calibrate.samplers import SAMPLERS
 from emulator.core import schema
 from emulator.core.errors import InputError
 from emulator.core.gaussian_process import CORRELATIONS
-from emulator.core.line_index import toml_lines
 from emulator.core.schema import OneOf, Table, documented, json_schema, table_of
 from emulator.surrogates.registry import FORWARD_MAPS, forward_kind, known_options
 
@@ -87,14 +86,8 @@ def read_experiment(path: str | Path, entries: Mapping[str, Any] = {}) -> Proble
         One line naming the file, its line and key, what was found and what would be right.
     """
     path = Path(path)
-    file_name = f"experiment file {path}"
-    if not path.is_file():
-        raise InputError(f"{file_name} does not exist")
-    try:
-        text = path.read_text(encoding="utf-8")
-        file, lines = tomllib.loads(text), toml_lines(text)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{file_name} is not valid TOML: {error}") from error
+    source = schema.read_toml(path, "experiment file")
+    file_name, file, lines = source.name, source.data, source.lines
 
     def problem(table: Mapping[str, Any], table_lines: Mapping[Any, int], where: str) -> Problem:
         if "data" in table and "observe" in table and table["data"] != SYNTHETIC:

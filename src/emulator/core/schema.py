@@ -9,6 +9,7 @@ from __future__ import annotations
 import inspect
 import json
 import re
+import tomllib
 import types
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -23,7 +24,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, core_schema
 
 from emulator.core.errors import InputError, closest, look_up
-from emulator.core.line_index import Path, json_lines, line_of
+from emulator.core.line_index import Path, json_lines, line_of, toml_lines
 from emulator.core.store import read_json
 
 # ``names : text``, with its further lines indented; under a heading of its section or without one.
@@ -196,6 +197,21 @@ class Source:
         if isinstance(path[-1], int):
             return f"[[{'.'.join(map(str, path[:-1]))}]] number {path[-1] + 1}"
         return f"[{'.'.join(map(str, path))}]"
+
+
+def read_toml(path: FilePath, noun: str) -> Source:
+    """Return the content of a TOML file, which messages call ``noun`` and its path.
+
+    Raises :class:`InputError` where there is no such file, or its content is not valid TOML.
+    """
+    name = f"{noun} {path}"
+    if not path.is_file():
+        raise InputError(f"{name} does not exist")
+    try:
+        text = path.read_text(encoding="utf-8")
+        return Source(name, tomllib.loads(text), toml_lines(text))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{name} is not valid TOML: {error}") from error
 
 
 def parse[Model: BaseModel](model: type[Model], source: Source) -> Model:

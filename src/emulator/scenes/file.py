@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from emulator.core.errors import InputError, look_up
-from emulator.core.line_index import toml_lines
 from emulator.geometry.io import Body, read_body, read_mesh, read_regions
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.refinement import to_quadratic
@@ -40,18 +38,11 @@ def read_scene(path: str | Path) -> Scene:
     InputError
         One line naming the file, its line and key, what was found and what would be right.
     """
-    from emulator.core.schema import Source, parse
+    from emulator.core.schema import parse, read_toml
     from emulator.scenes.file_schema import SceneFile
 
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"scene file {path} does not exist")
-    try:
-        text = path.read_text(encoding="utf-8")
-        entries = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"scene file {path} is not valid TOML: {error}") from error
-    source = Source(f"scene file {path}", entries, toml_lines(text))
+    source = read_toml(path, "scene file")
     file = parse(SceneFile, source)
     with source.at("law"):
         law = find_law(file.law)
