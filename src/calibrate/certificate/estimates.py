@@ -42,12 +42,12 @@ from calibrate.certificate.verdict import (
     Evidence,
     Figure,
     Physics,
-    Sampling,
     Tail,
 )
 from calibrate.posterior import Posterior
-from calibrate.posterior.diagnosis import Misfit, places_of
+from calibrate.posterior.diagnosis import Misfit, Sampling, places_of
 from calibrate.samplers.diagnostics import effective, normalised, pareto_shape
+from calibrate.statistical_model.errors import in_noise_sd
 
 GROUPS = 25
 _DRAWS = 1000  # draws of the posterior predictive check
@@ -140,6 +140,7 @@ def evidence_of(
         physics_of(at_draws, training, tests),
         tail_of(tests, missed, modes),
         misfits(pool.predictive, pool.correction, z, key_from(rng)),
+        map_errors(pool.predictive, at_draws),
     )
 
 
@@ -242,6 +243,13 @@ def physics_of(at_draws: Runs, training: Runs, tests: Tests) -> Physics:
         sum(not s for s in examined),
         len(examined),
     )
+
+
+def map_errors(predictive: Predictive, at_draws: Runs) -> dict[str, float]:
+    """Return the distance of the map's data from FEM's in noise sd, by the observation's name."""
+    means, valid = predictive.means(at_draws.z)
+    rows = valid & at_draws.converged
+    return in_noise_sd(predictive.model, (means - at_draws.means)[rows])
 
 
 def missed_by(tests: Tests, runs: Runs) -> int:

@@ -13,8 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from calibrate.posterior.diagnosis import SMALLEST_P, Misfit
-from calibrate.samplers.diagnostics import REFUSE_ABOVE_R_HAT, REFUSE_BELOW_ESS
+from calibrate.posterior.diagnosis import SMALLEST_P, Misfit, Sampling, map_fault, sampling_faults
 from emulator.core.display import TableRepr
 
 Verdict = Literal["accepted", "reweight", "not certified", "undecided"]
@@ -36,7 +35,6 @@ LARGEST_WIDENED_SHIFT = 1.5
 # proposals cover the prior, so that the ratios are bounded (docs/experiments.md, "When k-hat cries
 # wolf").
 NO_TAIL = 6.0
-LARGEST_DIVERGENT = 0.002
 LARGEST_FAILED = 0.02
 SMALLEST_P_WORST = 0.001
 # Spread of the log ratio of FEM's likelihood over the corrected map's, above which the two are too
@@ -147,22 +145,6 @@ class MeshChange(Changes):
 
 
 @dataclass(frozen=True)
-class Sampling:
-    """The quality of the draws: largest R-hat, smallest effective sample sizes, divergences.
-
-    transitions : the number of draws.
-    vary : whether the draws of every parameter vary.
-    """
-
-    r_hat: float
-    ess_bulk: float
-    ess_tail: float
-    divergences: int
-    transitions: int
-    vary: bool = True
-
-
-@dataclass(frozen=True)
 class Physics:
     """The outcome of the FEM runs.
 
@@ -213,6 +195,8 @@ class Evidence:
     corrected : the changes from the corrected map's posterior to FEM's.
     mean, sd : the mean and sd of each parameter under FEM, in its unit.
     misfit : the posterior predictive check of each observation.
+    map_errors : the distance of the map's data from FEM's at the draws, in noise sd, by
+        observation; empty where the likelihood allows for it.
     mesh : the changes by a finer mesh.
     """
 
@@ -224,6 +208,7 @@ class Evidence:
     physics: Physics
     tail: Tail
     misfit: dict[str, Misfit]
+    map_errors: dict[str, float] = field(default_factory=dict)
     mesh: MeshChange = MeshChange(why="not asked")
 
 
@@ -295,6 +280,7 @@ class Certificate(TableRepr):
                 "not_asked": e.mesh.why,
             },
             "misfit": {name: asdict(m) for name, m in e.misfit.items()},
+            "map_errors": e.map_errors,
             **{name: asdict(getattr(e, name)) for name in ("sampling", "physics", "tail")},
         }
 
@@ -317,13 +303,17 @@ def judge(evidence: Evidence) -> Certificate:
 
     Every comparison is written so that NaN fails it.
     """
-    faults = list(_faults(evidence))
     verdict, agreement = _agreement(evidence)
+    faults, others = list(sampling_faults(evidence.sampling)), list(_faults(evidence))
+    wrong_map, agrees = map_fault(evidence.map_errors), verdict in ("accepted", "reweight")
     mesh_is_fine, mesh = _mesh(evidence.mesh)
-    if faults or mesh_is_fine is False:
+    if faults or others or mesh_is_fine is False:
         verdict = "not certified"
     elif mesh_is_fine is None and verdict in ("accepted", "reweight"):
         verdict = "undecided"
+    if wrong_map and (faults or not agrees):  # then chains are no fault of the sampler
+        faults = [wrong_map, *((words, "mend the map first") for words, _ in faults)]
+    faults += others
     if evidence.mesh.why and verdict == "accepted":
         agreement = [(f"{agreement[0][0]} on this mesh", "")]
     findings = [*faults, *agreement, *mesh] if mesh_is_fine else [*faults, *mesh, *agreement]
@@ -408,23 +398,8 @@ def _weights(tail: Tail) -> tuple[Verdict, list[Finding]] | None:
 
 
 def _faults(evidence: Evidence) -> Iterator[Finding]:
-    """Yield what is wrong with the draws, FEM at them, and the data, whatever FEM says of them."""
-    s, p = evidence.sampling, evidence.physics
-    if not s.vary:
-        yield ("the draws of a parameter do not vary", "the sampler is stuck")
-    elif not np.isfinite(s.r_hat):
-        yield ("R-hat is not a number", "draw more")
-    elif not s.r_hat <= REFUSE_ABOVE_R_HAT:
-        yield (f"the chains disagree, R-hat {s.r_hat:.3f}", "draw more, or find their modes")
-    if not s.divergences <= max(LARGEST_DIVERGENT * s.transitions, 1):
-        yield (
-            f"{s.divergences} of {s.transitions} transitions diverged",
-            "the sampler cannot follow the posterior everywhere; raise target_accept, or narrow a "
-            "prior the data leaves open",
-        )
-    if s.vary and not np.min([s.ess_bulk, s.ess_tail]) >= REFUSE_BELOW_ESS:
-        few = f"{s.ess_bulk:.0f} in the bulk and {s.ess_tail:.0f} in the tails"
-        yield (f"too few effective draws, {few}", f"draw until both reach {REFUSE_BELOW_ESS:.0f}")
+    """Yield what is wrong with FEM at the draws, and with the data, whatever FEM says of them."""
+    p = evidence.physics
     if not p.failed_mass <= LARGEST_FAILED:
         yield (
             f"FEM fails on {100 * p.failed_mass:.0f} % of the posterior",

@@ -25,11 +25,18 @@ import xarray as xr
 
 from calibrate.arviz import base, stats
 from calibrate.samplers import r_hat
-from calibrate.samplers.diagnostics import ENOUGH_ESS, WARN_ABOVE_R_HAT
+from calibrate.samplers.diagnostics import (
+    ENOUGH_ESS,
+    REFUSE_ABOVE_R_HAT,
+    REFUSE_BELOW_ESS,
+    WARN_ABOVE_R_HAT,
+)
 from calibrate.samplers.laplace import MISSED_AT, MISSED_BY
 
 SMALLEST_P = 0.005
 OUTLYING = 4.0  # sds, beyond which 0.6 % of sets of 100 Gaussian data have a datum
+LARGEST_MAP_ERROR = 0.5  # noise sd by which the forward map may miss FEM's data
+LARGEST_DIVERGENT = 0.002
 _FEWEST = 200  # replicates from which such a small p can be estimated
 _LARGEST_K = 0.7  # Vehtari et al. (2024)
 _LOWEST_EFFICIENCY = 0.2
@@ -37,6 +44,60 @@ _LOWEST_ACCEPTANCE = 0.1
 _MANY = 100.0
 _MARKED = 0.5  # standard deviations from which a shift of divergences is reported
 _NAMED = 3  # largest number of parameters that a sentence names
+
+
+Fault = tuple[str, str]
+"""A statement about what is wrong, and a remedy; empty where there is none."""
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """The quality of the draws: largest R-hat, smallest effective sample sizes, divergences.
+
+    transitions : the number of draws.
+    vary : whether the draws of every parameter vary.
+    """
+
+    r_hat: float
+    ess_bulk: float
+    ess_tail: float
+    divergences: int
+    transitions: int
+    vary: bool = True
+
+
+def sampling_faults(s: Sampling) -> Iterator[Fault]:
+    """Yield what makes draws useless for a certificate; NaN is at fault."""
+    if not s.vary:
+        yield ("the draws of a parameter do not vary", "the sampler is stuck")
+    elif not np.isfinite(s.r_hat):
+        yield ("R-hat is not a number", "draw more")
+    elif not s.r_hat <= REFUSE_ABOVE_R_HAT:
+        yield (f"the chains disagree, R-hat {s.r_hat:.3f}", "draw more, or find their modes")
+    if not s.divergences <= max(LARGEST_DIVERGENT * s.transitions, 1):
+        yield (
+            f"{s.divergences} of {s.transitions} transitions diverged",
+            "the sampler cannot follow the posterior everywhere; raise target_accept, or narrow a "
+            "prior the data leaves open",
+        )
+    if s.vary and not np.min([s.ess_bulk, s.ess_tail]) >= REFUSE_BELOW_ESS:
+        few = f"{s.ess_bulk:.0f} in the bulk and {s.ess_tail:.0f} in the tails"
+        yield (f"too few effective draws, {few}", f"draw until both reach {REFUSE_BELOW_ESS:.0f}")
+
+
+def map_fault(errors: Mapping[str, float]) -> Fault | None:
+    """Return what the forward map misses most, if by more than a share of the noise.
+
+    errors : the distance of the map's data from FEM's at the draws, in noise sd, by observation.
+    """
+    worst = max(errors, key=lambda name: np.nan_to_num(errors[name]), default="")
+    if not (worst and errors[worst] > LARGEST_MAP_ERROR):
+        return None
+    return (
+        f"the forward map misses FEM by {errors[worst]:.2g} noise sd in {worst} at the draws",
+        "infer with --forward corrected (or more of its --steps), or let the map's error widen the "
+        "posterior (--error-runs N)",
+    )
 
 
 def summary_of(

@@ -197,6 +197,24 @@ def with_error(
     return replace(model, error=fitted)
 
 
+def in_noise_sd(model: Model, errors: np.ndarray) -> dict[str, float]:
+    """Return the size of the map's errors in noise sd, by the observation's name.
+
+    It is the root mean square over an observation's numbers, and the median over the draws. Empty
+    without draws, and where the likelihood allows for the map's error.
+
+    errors : the map's data less FEM's at draws, flat (s, m).
+    """
+    if not len(errors) or (model.error is not None and model.error.amplitude is not None):
+        return {}
+    unravel = ravel_pytree({name: jnp.zeros(n) for name, n in model.observe.shapes.items()})[1]
+    sizes = {}
+    for name, each in jax.vmap(unravel)(jnp.asarray(errors)).items():
+        square = np.square(np.asarray(each).reshape(len(errors), -1))
+        sizes[name] = float(np.median(np.sqrt(square.mean(axis=1))) / model.noise[name].upper_sd)
+    return sizes
+
+
 def fit(
     unknowns: np.ndarray, errors: np.ndarray, information: np.ndarray, *, of_mesh: bool = False
 ) -> ModelError:

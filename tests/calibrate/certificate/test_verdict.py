@@ -142,3 +142,32 @@ def test_json_has_every_figure_with_its_error():
     assert written["shift_error"] == {"x": 0.01}
     assert written["mean_fem"] == {"x": 1.0}
     assert written["misfit"]["displacement"]["p"] == 0.4
+
+
+def test_a_wrong_map_is_named_before_the_chains_that_disagree_on_it():
+    wrong = {"reaction:right:x@s1": 0.1, "reaction:right:x@s4": 5.2}
+    bad = replace(RIGHT.sampling, r_hat=1.5, ess_bulk=7.0)
+    certificate = judge(replace(RIGHT, map_errors=wrong, sampling=bad))
+    assert certificate.verdict == "not certified"
+    assert certificate.reason == (
+        "the forward map misses FEM by 5.2 noise sd in reaction:right:x@s4 at the draws"
+    )
+    first, *rest = certificate.findings
+    assert "--forward corrected" in first
+    assert "--error-runs N" in first
+    assert "the chains disagree, R-hat 1.500: mend the map first" in rest
+    assert "draw" not in rest[1].partition(": ")[2]
+    assert certificate.to_json()["map_errors"] == wrong
+
+
+def test_a_wrong_map_is_not_named_where_fem_repairs_it_and_decides_nothing_by_itself():
+    wrong = {"x": 2.0}
+    assert judge(replace(RIGHT, map_errors=wrong)).findings == judge(RIGHT).findings
+    assert "map" not in verdict(map_errors=wrong, draws=changes(0.6))[1]
+    open_ = judge(replace(RIGHT, map_errors=wrong, draws=changes(0.25, error=0.04)))
+    assert (open_.verdict, open_.findings[0][:22]) == ("undecided", "the forward map misses")
+    assert "R-hat 1.500: draw more" in " ".join(
+        judge(
+            replace(RIGHT, map_errors={"x": 0.3}, sampling=replace(RIGHT.sampling, r_hat=1.5))
+        ).findings
+    )
