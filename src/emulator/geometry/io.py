@@ -8,15 +8,15 @@ sets (VTU, XDMF) a set is an array of 0 and 1 called ``set:<name>``, on triangle
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import meshio
 import numpy as np
+from meshio import _helpers
 
 from emulator.core.errors import InputError
 from emulator.core.store import replacing
@@ -195,16 +195,21 @@ def read_cells(path: Path) -> meshio.Mesh:
         raise InputError(f"mesh file {path} {what}")
     if not path.stat().st_size:
         raise InputError(f"mesh file {path} is empty")
-    output = io.StringIO()
+    reasons = []
     try:
-        # meshio's readers raise exceptions of many types, or print a reason and exit.
-        # In a text file of STL it takes letters for a number of triangles, which overflows.
-        with redirect_stdout(output), redirect_stderr(output), np.errstate(over="ignore"):
-            return meshio.read(path)
-    except (Exception, SystemExit) as error:
-        reason = output.getvalue() if isinstance(error, SystemExit) else str(error)
-        reason = " ".join(reason.split())[:160] or type(error).__name__
-        raise InputError(f"mesh file {path} cannot be read as a mesh: {reason}") from error
+        # meshio.read prints why its readers refuse a file, and exits; standard output could only
+        # be caught for all threads. Readers raise exceptions of many types.
+        # In a text file of STL one takes letters for a number of triangles, which overflows.
+        for kind in _helpers._filetypes_from_path(path):
+            try:
+                with np.errstate(over="ignore"):
+                    return _helpers.reader_map[kind](str(path))
+            except meshio.ReadError as error:
+                reasons.append(f"not valid {kind}: {error}".removesuffix(": "))
+    except Exception as error:
+        reasons = [str(error) or type(error).__name__]
+    reason = " ".join("; ".join(reasons).split())[:160]
+    raise InputError(f"mesh file {path} cannot be read as a mesh: {reason}")
 
 
 @contextmanager

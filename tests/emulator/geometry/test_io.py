@@ -6,6 +6,7 @@ from emulator.core.errors import InputError
 from emulator.geometry.generators.box import box
 from emulator.geometry.io import (
     read_body,
+    read_cells,
     read_mesh,
     write_mesh,
     write_solution,
@@ -300,6 +301,20 @@ def test_nothing_half_written(tmp_path):
     with pytest.raises(ValueError, match=r"len\(point"):
         write_solution(tmp_path / "body.vtu", mesh, np.zeros((3, 3)))
     assert not list(tmp_path.iterdir())
+
+
+def test_a_reader_that_refuses_a_file_leaves_other_output_alone(tmp_path, capsys, monkeypatch):
+    """meshio prints the reason and exits; what other threads print meanwhile is theirs."""
+
+    def refuse(path):
+        print("another thread's line")
+        raise meshio.ReadError("no facets")
+
+    monkeypatch.setitem(meshio._helpers.reader_map, "stl", refuse)
+    (tmp_path / "wall.stl").write_text("solid")
+    with pytest.raises(InputError, match="cannot be read as a mesh: not valid stl: no facets$"):
+        read_cells(tmp_path / "wall.stl")
+    assert capsys.readouterr() == ("another thread's line\n", "")
 
 
 def test_unusable_mesh_files_are_named(tmp_path, capsys):
