@@ -10,6 +10,7 @@ import numpyro.distributions as dist
 
 import calibrate as cal
 from emulator.fem.solution import Solution, Status
+from emulator.fem.unloading import unchecked
 from emulator.scenes.scene import all_nodes
 from emulator.surrogates.protocol import Prediction, fingerprint_of
 
@@ -45,6 +46,15 @@ def linear_forward(scene, seed=0, size=0.01, bias=0.0, of=LinearForward, **more)
     count = len(scene.mesh.nodes)
     matrix = size * rng.normal(size=(count, 3, len(scene.parameters)))
     return of(scene, all_nodes(scene), matrix, np.full((count, 3), bias), **more)
+
+
+def about_zero(scene, *names):
+    """``scene`` with these parameters on a uniform scale, in a range that no scene may have."""
+    parameters = (
+        replace(each, low=-each.high, scale="uniform") if each.name in names else each
+        for each in scene.parameters
+    )
+    return unchecked(scene, parameters=tuple(parameters))
 
 
 class Step:

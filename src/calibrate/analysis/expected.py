@@ -1,8 +1,8 @@
 r"""What data would determine before there is any, and what to measure next.
 
 **Information.** With :math:`g(x)` the data without noise as a function of the unknowns
-:math:`x = \log\theta` (:math:`\theta` itself where it may be 0 or below), and S the covariance of
-the data about it, the data hold the Fisher information
+x, :math:`\log\theta` or :math:`\theta` as the parameter's scale is, and S the covariance of the
+data about it, the data hold the Fisher information
 
 .. math:: F = J^T S^{-1} J, \qquad J = \partial g / \partial x, \qquad S = C + \alpha^2 V V^T
 
@@ -29,7 +29,6 @@ and Q are then those of the weighted draws, and it is done again (Cappe et al. 2
 If too few draws carry the weight, the covariance is Q. Posteriors are
 averaged, not informations: by Jensen's inequality the inverse of a mean information is less than
 the mean posterior covariance, and a box of a prior ends where a Gaussian does not.
-:math:`x = \log\theta` where all unknowns are positive, else :math:`\theta`.
 
 Data sets that are not measured yet differ in their shared errors: modes that depend on where points
 were seen, as pins' modes do, are made of the mean :math:`g(x_r)` of each set, so that the errors of
@@ -102,9 +101,7 @@ At = Callable[[jax.Array, ModelError | None, jax.Array], jax.Array]
 information F (q, q)."""
 
 
-def information_at(
-    model: Model, observe: Observations, noise: Mapping[str, Noise], *, log: bool
-) -> At:
+def information_at(model: Model, observe: Observations, noise: Mapping[str, Noise]) -> At:
     """Return F of data ``observe`` with ``noise`` of known sd, as a function of x.
 
     Both may be other than the model's: a measurement to add, in all of its load states or some.
@@ -123,7 +120,7 @@ def information_at(
     forward = model.full.at(observe.nodes)
 
     def data(x: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
-        thetas = model.states.thetas(dict(zip(names, jnp.exp(x) if log else x, strict=True)))[rows]
+        thetas = model.states.thetas(dict(zip(names, model.from_scales(x), strict=True)))[rows]
         u = jnp.stack([forward.evaluate(theta).displacement for theta in thetas])
         means = observe(u, thetas)
         return ravel_pytree(means)[0], means
@@ -132,7 +129,7 @@ def information_at(
         J, means = jax.jacfwd(data, has_aux=True)(x)
         about_means = information_about_means(noise, means)
         if error is not None:
-            unknowns = jnp.concatenate([jnp.exp(x) if log else x, sizes])
+            unknowns = jnp.concatenate([model.from_scales(x), sizes])
             about_means = error.information_left(about_means, unknowns, means)
         return J.T @ about_means @ J
 
@@ -159,11 +156,10 @@ def expected_precision(
 
     Returns
     -------
-    sd : the expected posterior sd of each unknown relative to the prior's, in log theta where all
-        unknowns are positive.
+    sd : the expected posterior sd of each unknown relative to the prior's, on its parameter's
+        scale.
     combinations : the combinations of :func:`~calibrate.analysis.identifiability.identify` that
-        the data would inform, from the mean posterior covariance; empty where an unknown may be 0
-        or below.
+        the data would inform, from the mean posterior covariance.
 
     Raises
     ------
@@ -177,46 +173,40 @@ def expected_precision(
         )
     errors: Errors = errors_of_data(model, systematic) if systematic else lambda _: model.error
     names, prior = model.states.unknowns, prior_table(model)
-    log = bool((prior > 0.0).all())
-    before = np.atleast_2d(np.cov(np.log(prior) if log else prior, rowvar=False))
+    x = np.asarray(model.on_scales(prior))
+    before = np.atleast_2d(np.cov(x, rowvar=False))
+    mean = prior.mean(axis=0)
     if at is None:
-        covariances = _posterior_covariances(model, errors, prior, before, data_sets, seed, log=log)
+        covariances = _posterior_covariances(model, errors, x, before, data_sets, seed)
     else:
         means, valid = model.predict({name: jnp.asarray(float(at[name])) for name in names})
         _some(valid)
         error = errors(means)
-        information_of = information_at(model, model.observe, model.noise, log=log)
-        x = jnp.asarray([np.log(at[name]) if log else at[name] for name in names])
-        by_size = jax.jit(jax.vmap(lambda sizes: information_of(x, error, sizes)))(sizes_of(error))
+        information_of = information_at(model, model.observe, model.noise)
+        mean = np.array([float(at[name]) for name in names])
+        centre = model.on_scales(mean)
+        by_size = jax.jit(jax.vmap(lambda sizes: information_of(centre, error, sizes)))(
+            sizes_of(error)
+        )
         covariances = np.linalg.inv(np.asarray(by_size) + np.linalg.inv(before))
     sd = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)).mean(axis=0)
     ratio = sd / np.sqrt(np.diagonal(before))
     many = sum(int(np.prod(part.shape)) for part in model.observe.parts.values())
-    best = combinations(names, covariances.mean(axis=0), before)[:many] if log else []
+    best = combinations(model, covariances.mean(axis=0), before, mean)[:many]
     return {"sd": dict(zip(names, ratio.tolist(), strict=True)), "combinations": best}
 
 
 def _posterior_covariances(
-    model: Model,
-    errors: Errors,
-    prior: np.ndarray,
-    before: np.ndarray,
-    count: int,
-    seed: int,
-    *,
-    log: bool,
+    model: Model, errors: Errors, prior: np.ndarray, before: np.ndarray, count: int, seed: int
 ) -> np.ndarray:
-    """Return the posterior covariances (r, q, q) given data made at draws of the prior (s, q)."""
-    names = model.states.unknowns
-
-    def thetas(x: jax.Array) -> jax.Array:
-        return jnp.exp(x) if log else x
+    """Return posterior covariances (r, q, q) given data made at draws of the prior's x (s, q)."""
+    names, thetas = model.states.unknowns, model.from_scales
 
     def values(x: jax.Array) -> dict[str, jax.Array]:
         return dict(zip(names, thetas(x), strict=True))
 
     def log_prior(x: jax.Array) -> jax.Array:
-        log_density = model.log_prior(values(x)) + (jnp.sum(x) if log else 0.0)
+        log_density = model.log_prior(values(x)) + jnp.sum(jnp.where(model.on_log_scale, x, 0.0))
         return jnp.where(jnp.isnan(log_density), -jnp.inf, log_density)
 
     def predicted(x: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
@@ -230,8 +220,8 @@ def _posterior_covariances(
             log_density += log_ratio(error, thetas(x), residual, means)
         return jnp.where(valid & jnp.isfinite(log_density), log_density, -jnp.inf)
 
-    information = information_at(model, model.observe, model.noise, log=log)
-    shared = jnp.asarray(np.log(prior[count:]) if log else prior[count:])[:_FROM_PRIOR]
+    information = information_at(model, model.observe, model.noise)
+    shared = jnp.asarray(prior[count:][:_FROM_PRIOR])
     precision = jnp.asarray(np.linalg.inv(before))
     ask = jax.jit(partial(jax.lax.map, predicted, batch_size=_BATCH))
     ahead = ask(shared)
@@ -281,7 +271,7 @@ def _posterior_covariances(
             proposal = around(mean, C)
         return C
 
-    truths = jnp.asarray(np.log(prior[:count]) if log else prior[:count])
+    truths = jnp.asarray(prior[:count])
     means, valid = ask(truths)
     rows = _some(valid)
     truths, means = truths[rows], {name: mean[rows] for name, mean in means.items()}
@@ -366,16 +356,13 @@ def next_measurement(
     """
     model, draws = posterior.model, posterior.draws()
     table = np.stack([draws[name] for name in model.states.unknowns], axis=1)
-    log = bool((table > 0.0).all())
-    x = np.log(table) if log else table
+    x = np.asarray(model.on_scales(table))
     covariance = np.atleast_2d(np.cov(x, rowvar=False))
     root = np.linalg.cholesky(covariance)
     rows = np.linspace(0, len(x) - 1, min(_DRAWS, len(x))).astype(int)
     gains_by_name = {}
     for name, (part, noise) in candidates.items():
-        information_of = jax.jit(
-            information_at(model, Observations({name: part}), {name: noise}, log=log)
-        )
+        information_of = jax.jit(information_at(model, Observations({name: part}), {name: noise}))
         gains, ratios = [], []
         for k in rows:
             information = np.asarray(information_of(jnp.asarray(x[k]), None, jnp.zeros(0)))

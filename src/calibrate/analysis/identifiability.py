@@ -1,9 +1,10 @@
 r"""What data determined, with a prior and by likelihood alone, and what it says of the stress.
 
 **Combinations.** Stiffness and load can rise together and leave the body where it is; a table of
-marginals hides that. In :math:`x = \log\theta`, with covariances :math:`S` of the posterior and
-:math:`P` of the prior, the combinations :math:`\prod_k \theta_k^{w_k}` that the data determines,
-best first, solve
+marginals hides that. With covariances :math:`S` of the posterior and :math:`P` of the prior, in
+:math:`x_k = \log\theta_k` where that is the parameter's scale and in
+:math:`\theta_k / \bar\theta_k`, to first order the same, where its scale is uniform, the
+combinations :math:`\prod_k \theta_k^{w_k}` that the data determines, best first, solve
 
 .. math:: S w = \lambda P w
 
@@ -68,45 +69,50 @@ def identify(posterior: Posterior) -> dict[str, Any]:
         scale: 0 where nothing was learned, 1 where the posterior has no width.
     correlation : first -> second -> correlation, posterior, on the parameters' scales.
     combinations : best known first, each with its ``exponents``, its relative sd ``known_to`` in
-        the posterior and ``prior`` in the prior; empty where a parameter may be 0 or below.
+        the posterior and ``prior`` in the prior, without parameters whose range is not above 0.
     """
     model = posterior.model
     names, draws = model.states.unknowns, posterior.draws()
     after = np.stack([draws[name] for name in names], axis=1)
-    before = prior_table(model)
-    log = np.array(model.on_log_scale)
-    x, prior = (np.where(log, np.log(np.where(log, t, 1.0)), t) for t in (after, before))
+    x, prior = (np.asarray(model.on_scales(theta)) for theta in (after, prior_table(model)))
     contraction = 1.0 - x.std(axis=0, ddof=1) / prior.std(axis=0, ddof=1)
     correlation = np.atleast_2d(np.corrcoef(x, rowvar=False))
-    positive = bool((after > 0.0).all() and (before > 0.0).all())
-    covariances = [
-        np.atleast_2d(np.cov(np.log(t), rowvar=False)) for t in (after, before)
-    ] * positive
+    posterior_S, prior_S = (np.atleast_2d(np.cov(each, rowvar=False)) for each in (x, prior))
     return {
         "contraction": dict(zip(names, contraction.tolist(), strict=True)),
         "correlation": {
             first: {second: float(correlation[j, k]) for k, second in enumerate(names)}
             for j, first in enumerate(names)
         },
-        "combinations": combinations(names, *covariances) if positive else [],
+        "combinations": combinations(model, posterior_S, prior_S, after.mean(axis=0)),
     }
 
 
 def prior_table(model: Model) -> np.ndarray:
-    """Return draws (s, q) of the unknowns of theta from their prior."""
+    """Return draws (s, q) of the unknowns of theta from their prior, where each has its scale."""
     draws = model.prior_draws(jax.random.key(0), _PRIOR_DRAWS)
-    return np.stack([np.asarray(draws[name]) for name in model.states.unknowns], axis=1)
+    table = np.stack([np.asarray(draws[name]) for name in model.states.unknowns], axis=1)
+    return table[((table > 0.0) | ~model.on_log_scale).all(axis=1)]
 
 
 def combinations(
-    names: tuple[str, ...], after: np.ndarray, before: np.ndarray
+    model: Model, after: np.ndarray, before: np.ndarray, mean: np.ndarray
 ) -> list[dict[str, Any]]:
     """Return the products of powers that the data informs, the most contracted first.
 
     Parameters
     ----------
-    after, before : (q, q) covariances of log theta, of the posterior and of the prior.
+    after, before : (q, q) covariances of the posterior and of the prior, on the unknowns' scales.
+    mean : (q,) means of the unknowns.
     """
+    log, low = model.on_log_scale, np.array([parameter.low for parameter in model.parameters])
+    powers = np.flatnonzero(log | ((low >= 0.0) & (mean > 0.0)))
+    if not powers.size:
+        return []
+    names = [model.states.unknowns[k] for k in powers]
+    relative = np.where(log, 1.0, mean)[powers]
+    ratios = np.outer(relative, relative)
+    after, before = (S[np.ix_(powers, powers)] / ratios for S in (after, before))
     _, directions = eigh(after, before)  # eigenvalues ascend
     prior_sd = np.sqrt(np.diagonal(before))
     products = []

@@ -278,12 +278,9 @@ class Predictive:
         return x.mean(axis=0), x.std(axis=0)
 
     def _on_scales(self, draws: Mapping[str, jax.Array]) -> jax.Array:
-        """Return unknowns (..., q) of theta, as logarithms where their parameter's scale is log."""
-        columns = [
-            jnp.log(draws[name]) if log else draws[name]
-            for name, log in zip(self.model.states.unknowns, self.model.on_log_scale, strict=True)
-        ]
-        return jnp.stack(columns, axis=-1)
+        """Return the unknowns (..., q) of theta on their parameters' scales."""
+        columns = [draws[name] for name in self.model.states.unknowns]
+        return self.model.on_scales(jnp.stack(columns, axis=-1))
 
     @_compiled
     def _features(self, draws: Mapping[str, jax.Array]) -> jax.Array:

@@ -27,6 +27,7 @@ ceiling of elpd.
 
 from __future__ import annotations
 
+import json
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -156,9 +157,12 @@ def _all_data(name: str, tree: xr.DataTree) -> xr.DataTree:
     if "log_likelihood" not in tree:
         raise InputError(f"{name} has no log likelihoods; sample it with predictions")
     if tree.attrs.get("forward_error") not in (None, "null"):
+        systematic = json.loads(tree.attrs.get("run", "{}")).get("systematic")
+        learned = "its forward map's error (--error-runs; in Python it may be a systematic one)"
+        what = f"systematic errors ({', '.join(systematic)})" if systematic else learned
         raise InputError(
-            f"{name} allows for its forward map's error, which log likelihoods of single data "
-            "leave out; sample it without --error-runs"
+            f"{name} allows for {what}, which log likelihoods of single data leave out; sample it "
+            "without"
         )
     parts = [
         np.asarray(values).reshape(*values.shape[:2], -1)

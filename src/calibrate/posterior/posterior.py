@@ -124,7 +124,9 @@ class Posterior(TableRepr):
             for group in groups
         )
         attributes = {str(name): value for name, value in self.tree.attrs.items()}
-        faults = diagnose(draws, statistics, self.summary(), attributes)
+        faults = [*diagnose(draws, statistics, self.summary(), attributes)]
+        if "prior" in self.tree.children:
+            faults += predictions.shortfall(self.tree["prior"].sizes["draw"])
         return [*faults, *misfits(self.tree)]
 
     def save(self, path: str | Path) -> None:

@@ -78,7 +78,8 @@ def replicates(
 def prior_replicates(model: Model, rng_key: jax.Array, count: int = REPLICATES) -> Prior:
     """Return up to ``count`` draws of the prior, and data replicated there.
 
-    A tenth more is drawn; draws where the forward map has no answer are left out.
+    A tenth more is drawn; draws where the forward map has no answer are left out. If more than that
+    are, :func:`shortfall` says so.
     """
     keys = jax.random.split(rng_key, count + count // 10)
     if isinstance(model.forward, FEMForward):
@@ -88,6 +89,16 @@ def prior_replicates(model: Model, rng_key: jax.Array, count: int = REPLICATES) 
     draws, data, valid = jax.tree.map(np.asarray, prior)
     rows = np.flatnonzero(valid)[:count]
     return Prior(*({n: values[rows] for n, values in by.items()} for by in (draws, data)))
+
+
+def shortfall(found: int, asked: int = REPLICATES) -> list[str]:
+    """Return a sentence where the prior has ``found`` data sets and more were asked for."""
+    if found >= asked:
+        return []
+    return [
+        f"the prior predicts {found} data sets in place of {asked}: the forward map has no answer "
+        "at too many of its draws; give a narrower prior"
+    ]
 
 
 def spread(draws: Draws, count: int = REPLICATES) -> tuple[np.ndarray, Draws]:

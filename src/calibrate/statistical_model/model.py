@@ -36,6 +36,7 @@ from calibrate.statistical_model.load_states import LoadStates, load_states
 from calibrate.statistical_model.prior_range import check_known, fit_to, standardised
 from calibrate.whole_numpyro import mend_numpyro
 from emulator.core.errors import InputError
+from emulator.scenes.parameter_space import Parameter
 from emulator.surrogates.protocol import ForwardMap, Prediction
 
 mend_numpyro()
@@ -109,11 +110,26 @@ class Model:
         """Names of all that is inferred: unknowns of theta, then scales of noises and errors."""
         return (*self.states.unknowns, *self.noise_priors)
 
-    @property
-    def on_log_scale(self) -> tuple[bool, ...]:
-        """Whether each unknown of theta has a logarithmic scale in its scene."""
-        scales = {parameter.name: parameter.scale for parameter in self.forward.scene.parameters}
-        return tuple(scales[split(name)[0]] == "log" for name in self.states.unknowns)
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The parameter of its scene that each unknown of theta is, in one load state or in all."""
+        named = {parameter.name: parameter for parameter in self.forward.scene.parameters}
+        return tuple(named[split(name)[0]] for name in self.states.unknowns)
+
+    @cached_property
+    def on_log_scale(self) -> np.ndarray:
+        """Whether each unknown of theta has a logarithmic scale in its scene, (q,) bool."""
+        return np.array([parameter.scale == "log" for parameter in self.parameters], dtype=bool)
+
+    def on_scales(self, theta: jax.Array | np.ndarray) -> jax.Array:
+        """Return unknowns (..., q) of theta, as logarithms where their parameter's scale is log."""
+        log = self.on_log_scale
+        return jnp.where(log, jnp.log(jnp.where(log, theta, 1.0)), theta)
+
+    def from_scales(self, x: jax.Array) -> jax.Array:
+        """Return the inverse of :meth:`on_scales`."""
+        log = self.on_log_scale
+        return jnp.where(log, jnp.exp(jnp.where(log, x, 0.0)), x)
 
     @cached_property
     def sampled_priors(self) -> dict[str, dist.Distribution]:

@@ -74,28 +74,40 @@ class CorrectedForward:
         system = self.simulator.system
 
         @jax.custom_jvp
-        def correct(theta: jax.Array) -> jax.Array:
-            u = self.base(theta)
+        def correct(theta: jax.Array, start: jax.Array) -> jax.Array:
+            u = start
             for _ in range(self.steps):
                 u = newton_step(system, u, theta)
             return u
 
         @correct.defjvp
         def derivative(primals, tangents):  # noqa: ANN001, ANN202
-            (theta,), (direction,) = primals, tangents
-            u = correct(theta)
-            tangent = system.pattern.safe_values(system.tangent(u, theta))
-            _, (force, prescribed) = jax.jvp(system.residual_on_supports(u), (theta,), (direction,))
+            (theta, _), (direction, _) = primals, tangents
+            u = correct(*primals)
+            # Zero times the derivative at an impossible displacement would be NaN.
+            at = jnp.where(self._possible(u), u, 0.0)
+            tangent = system.pattern.safe_values(system.tangent(at, theta))
+            _, (force, prescribed) = jax.jvp(
+                system.residual_on_supports(at), (theta,), (direction,)
+            )
             return u, prescribed + system.extend(-system.solve(tangent, force))
 
         return correct
 
+    def _possible(self, u: jax.Array) -> jax.Array:
+        """Return whether ``u`` (n, 3) mm is finite and inverts no element."""
+        return jnp.all(jnp.isfinite(u)) & (jnp.min(volume_ratio(self.scene, u)) > 0.0)
+
     def evaluate(self, theta: jax.Array) -> Prediction:
-        """Return the displacement (k, 3) mm, valid where ``base`` is and no element is inverted."""
-        u = self._corrected(theta)
-        valid = jnp.all(jnp.isfinite(u)) & (jnp.min(volume_ratio(self.scene, u)) > 0.0)
-        u = jnp.where(valid, u, 0.0)
-        return Prediction(u[self.nodes], self.base.evaluate(theta).valid & valid)
+        """Return the displacement (k, 3) mm, valid where ``base`` is and no element is inverted.
+
+        Where ``base`` has no answer, the law may have none either: the value is the centre's.
+        """
+        start, known = self.base.evaluate(theta)
+        theta = jnp.where(known, theta, self.scene.centre)
+        u = self._corrected(theta, jax.lax.stop_gradient(start))
+        possible = self._possible(u)
+        return Prediction(jnp.where(possible, u, 0.0)[self.nodes], known & possible)
 
     def __call__(self, theta: jax.Array) -> jax.Array:
         """Return the displacement (k, 3) mm."""

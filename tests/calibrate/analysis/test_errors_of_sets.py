@@ -1,5 +1,7 @@
 """Errors that many numbers share, before data: dense covariances, and posteriors on grids."""
 
+from dataclasses import replace
+
 import numpy as np
 import numpyro.distributions as dist
 import pytest
@@ -10,7 +12,7 @@ from calibrate.analysis.expected import expected_precision
 from calibrate.analysis.identifiability import prior_table
 from calibrate.model_error.systematic import Systematic, curve_correlation
 from emulator.core.errors import InputError
-from linear_support import linear_forward
+from linear_support import about_zero, linear_forward
 from scene_support import block
 
 NODES, NOISE = [3, 11, 20], 0.1
@@ -58,7 +60,8 @@ def test_a_linear_map_has_the_dense_covariance(size):
     V, U = (5.0 * A[:, [k, k]].T + 1e-3 * rng.normal(size=(2, 9)) for k in (0, 1))
     known = Systematic(("a", "b"), {"displacement": V.reshape(2, 3, 3)})
     other = Systematic(("c", "d"), {"displacement": U.reshape(2, 3, 3)}, size)
-    bare = displacements(prior)
+    scene = about_zero(SCENE, "mu", "lam")
+    bare = displacements(prior, forward=replace(FORWARD, scene=scene))
     found = expected_precision(
         cal.with_systematic(bare, known, other), at={"mu": 3.0, "lam": -4.0}
     )["sd"]

@@ -12,10 +12,16 @@ import calibrate as cal
 import emulator as em
 from calibrate.analysis import expected
 from calibrate.analysis.expected import expected_precision, next_measurement
-from calibrate.analysis.identifiability import profile_likelihood, stress_band, stresses
+from calibrate.analysis.identifiability import (
+    identify,
+    prior_table,
+    profile_likelihood,
+    stress_band,
+    stresses,
+)
 from calibrate.posterior import Posterior
 from emulator.core.errors import InputError
-from linear_support import closed_form, linear_forward
+from linear_support import about_zero, closed_form, linear_forward
 
 NODES = np.array([3, 11, 20])
 NOISE = 0.1
@@ -44,6 +50,8 @@ def exact_posterior(model, forward, data, mean, sd, count=4000):
 def case(beam, forward):
     """Unknowns around zero, where nothing is taken in logarithms."""
     mean, sd = np.array([0.0, 1.0]), np.array([20.0, 30.0])
+    beam = about_zero(beam, "mu", "lam")
+    forward = replace(forward, scene=beam)
     model = model_of(beam, forward, mean, sd)
     data = np.asarray(forward.at(NODES)(jnp.array([3.0, -4.0])))
     return model, *exact_posterior(model, forward, data, mean, sd), mean, sd
@@ -107,6 +115,49 @@ def test_in_logarithms_it_names_the_combination_the_data_fixes(beam, forward):
     assert abs(exponents["mu"]) == 1.0
     relative = 1e-3 / 75.0 / np.linalg.norm(alike[NODES][..., 0])
     assert found["combinations"][0]["known_to"] == pytest.approx(relative, rel=1e-3)
+
+
+def posterior_of_draws(model, draws):
+    tree = arviz_base.from_dict({"posterior": {n: x[None] for n, x in draws.items()}})
+    return Posterior(tree, model, {})
+
+
+def test_logarithms_follow_the_declared_scale_not_the_sign_of_draws(beam, forward):
+    """One scale is uniform and reaches below 0; the prior of the other has a tail below 0."""
+    scene = about_zero(beam, "lam")
+    model = model_of(scene, replace(forward, scene=scene), (75.0, 0.0), (32.0, 20.0))
+    rng = np.random.default_rng(1)
+    draws = {"mu": np.exp(rng.normal(4.0, 0.01, 2000)), "lam": rng.normal(0.0, 2.0, 2000)}
+    found = identify(posterior_of_draws(model, draws))
+    table = prior_table(model)
+    assert 3900 < len(table) < 4096  # 1 % of the prior of mu has no logarithm
+    spreads = [np.log(table[:, 0]).std(ddof=1), table[:, 1].std(ddof=1)]
+    assert found["contraction"]["mu"] == pytest.approx(1.0 - 0.01 / spreads[0], abs=1e-3)
+    assert found["contraction"]["lam"] == pytest.approx(1.0 - 2.0 / spreads[1], abs=5e-3)
+    (only,) = found["combinations"]
+    assert only["exponents"] == {"mu": 1.0}
+    assert only["known_to"] == pytest.approx(0.01, rel=0.05)
+    # What is said before there is data is on the same scales.
+    before = expected_precision(model, at={"mu": 75.0, "lam": 1.0})
+    A = forward.matrix[NODES].reshape(-1, 2) * [75.0, 1.0]
+    prior = np.cov(np.stack([np.log(table[:, 0]), table[:, 1]]))
+    wanted = np.linalg.inv(A.T @ A / NOISE**2 + np.linalg.inv(prior))
+    ratio = np.sqrt(np.diagonal(wanted) / np.diagonal(prior))
+    np.testing.assert_allclose(list(before["sd"].values()), ratio, rtol=1e-6)
+
+
+def test_a_uniform_scale_above_0_enters_relative_to_its_mean(beam, forward):
+    """The product mu lam is known: exponents 1 and 1, whichever scale lam is declared on."""
+    mu, lam = beam.parameters
+    scene = replace(beam, parameters=(mu, replace(lam, scale="uniform")))
+    rng = np.random.default_rng(1)
+    mu = 75.0 * np.exp(rng.normal(0.0, 0.03, 4000))
+    draws = {"mu": mu, "lam": 75.0**2 / mu * np.exp(rng.normal(0.0, 0.001, 4000))}
+    for each in (beam, scene):
+        model = model_of(each, replace(forward, scene=each), (75.0, 75.0), (5.0, 5.0))
+        best = identify(posterior_of_draws(model, draws))["combinations"][0]
+        assert best["exponents"] == {"mu": 1.0, "lam": 1.0}
+        assert best["known_to"] == pytest.approx(0.001, rel=0.5)
 
 
 def test_an_unknown_noise_is_refused(beam, forward):

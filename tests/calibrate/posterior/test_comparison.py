@@ -151,8 +151,14 @@ def test_only_models_of_the_same_data(problems, trees):
         compare({"a": right, "b": bare})
     allowed = right.copy(deep=True)
     allowed.attrs["forward_error"] = "abc"
-    with pytest.raises(InputError, match="b allows for its forward map's error"):
+    with pytest.raises(InputError, match=r"b allows for its forward map's error \(--error-runs"):
         compare({"a": right, "b": allowed})
+    allowed.attrs["run"] = json.dumps({"systematic": {"camera": {}, "pins": {}}, "error_runs": 0})
+    with pytest.raises(
+        InputError, match=r"b allows for systematic errors \(camera, pins\)"
+    ) as told:
+        compare({"a": right, "b": allowed})
+    assert "--error-runs" not in str(told.value)
 
 
 def test_the_command(posteriors, tmp_path, capsys, monkeypatch):

@@ -1,13 +1,19 @@
 """Data replicated at draws of the prior, by solves that are driven from Python."""
 
+from dataclasses import replace
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import calibrate as cal
 import emulator as em
+from calibrate.analysis.sbc import sbc
+from calibrate.posterior import predictions
 from calibrate.posterior.predictions import _over_draws, _prior, prior_replicates
 from certificate_support import exact_data, linear_model, posterior_of
+from linear_support import linear_forward
 
 
 @pytest.mark.slow
@@ -111,3 +117,21 @@ def test_draws_at_which_the_map_has_no_answer_are_named(beam):
 def test_an_observation_without_nodes_is_predicted(beam, posterior):
     found = posterior.predict({"mu": 75.0}, cal.MeasuredParameter(beam, "mu"))
     np.testing.assert_array_equal(found.ravel(), 75.0)
+
+
+def test_prior_predictions_that_are_fewer_than_asked_for_are_told(beam):
+    """A map without an answer in a large part of its box."""
+    forward = replace(linear_forward(beam), limit=68.0)
+    tip = cal.nodal_displacements(beam, [40])
+    model = cal.model(forward, tip, cal.GaussianNoise(sd=0.2), check_scale=False)
+    data = np.asarray(model.forward(jnp.array([60.0, 60.0])))
+    options = cal.NUTSOptions(warmup=20, draws=20, chains=1)
+    found = cal.sample(model, data, options=options)
+    count = found.tree["prior"].sizes["draw"]
+    assert 50 < count < 400
+    sentence = f"the prior predicts {count} data sets in place of 500"
+    assert any(told.startswith(sentence) for told in found.warnings())
+    with pytest.raises(em.InputError, match=r"calibration: the prior predicts \d+ data sets in "):
+        sbc(model, 20)
+    everywhere = prior_replicates(linear_model(beam), jax.random.key(0))
+    assert predictions.shortfall(len(everywhere.draws["mu"])) == []

@@ -10,7 +10,7 @@ from emulator.scenes.scene import all_nodes
 from emulator.surrogates.corrected import corrected
 from emulator.surrogates.fem import fem_forward
 from emulator.surrogates.pod_gp import fit_reduced
-from emulator.surrogates.protocol import Prediction
+from emulator.surrogates.protocol import Prediction, inside_only
 
 
 class Off:
@@ -64,6 +64,40 @@ def test_validity_and_nodes(beam, simulator):
     wild = corrected(Off(simulator, 1e4), simulator).evaluate(beam.centre)
     assert not wild.valid
     assert np.isfinite(wild.displacement).all()
+
+
+class Fitted(Off):
+    """Known inside the box only: NaN, and so are its slopes, where mu is below it."""
+
+    def __call__(self, theta):
+        low = jnp.asarray([parameter.low for parameter in self.scene.parameters])
+        return super().__call__(theta) * (1.0 + 1e-3 * jnp.sum(jnp.sqrt(theta - low)))
+
+    def evaluate(self, theta):
+        return inside_only(self, theta)
+
+
+@pytest.mark.parametrize("theta", [[-20.0, 70.0], [1e-300, 70.0], [jnp.nan, 70.0], [1e308, 70.0]])
+def test_outside_the_box_value_and_slopes_are_finite(beam, simulator, theta):
+    polished = corrected(Fitted(simulator, 0.1), simulator)
+    at = jnp.asarray([theta, beam.centre])
+    weights = jnp.asarray(np.random.default_rng(0).normal(size=beam.held.shape))
+    f = lambda t: jnp.vdot(weights, polished.evaluate(t).displacement)
+    found = jax.jit(jax.vmap(polished.evaluate))(at)
+    assert found.valid.tolist() == [False, True]
+    assert np.isfinite(found.displacement).all()
+    slopes = jax.jit(jax.vmap(jax.grad(f)))(at)
+    assert np.isfinite(slopes).all()
+    np.testing.assert_allclose(slopes[1], jax.grad(f)(at[1]), rtol=1e-6)
+    assert np.isfinite(jax.grad(f)(at[0])).all()
+    _, along = jax.jvp(polished, (at[0],), (jnp.ones(2),))
+    assert np.isfinite(along).all()
+
+
+def test_a_start_that_inverts_elements_leaves_slopes_finite(beam, simulator):
+    wild = corrected(Off(simulator, 1e4), simulator)
+    assert not wild.evaluate(beam.centre).valid
+    assert np.isfinite(jax.grad(lambda t: wild(t).sum())(beam.centre)).all()
 
 
 def test_label_and_fingerprint(beam, cube, simulator):

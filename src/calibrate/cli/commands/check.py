@@ -45,6 +45,7 @@ def _sbc(arguments: Namespace) -> Answer:
     from calibrate.analysis.sbc import sbc
     from calibrate.cli.run_words import noise_words, problem_of
     from calibrate.figures.sensitivity import draw_calibration
+    from calibrate.posterior.predictions import shortfall
     from calibrate.project import by_fem, model_before_data
     from calibrate.samplers import NUTSOptions
 
@@ -79,7 +80,8 @@ def _sbc(arguments: Namespace) -> Answer:
     header = ("quantity", "50 %", "80 %", "90 %", "95 %", "outside band")
     verdict = "calibrated" if calibration.passed else "NOT calibrated"
     verdict = f"{calibration.replicates} data sets: {verdict}"
-    text = f"{table(header, rows)}\n{verdict}\nwritten to {folder}"
+    lines = [verdict, *shortfall(calibration.replicates, arguments.replicates)]
+    text = "\n".join([table(header, rows), *lines, f"written to {folder}"])
     return Answer(result, text, calibration.passed)
 
 
@@ -92,7 +94,7 @@ def _prior(arguments: Namespace) -> Answer:
     from calibrate.cli.run_words import problem_of
     from calibrate.figures.sensitivity import draw_prior_predictive
     from calibrate.measurements.volume import in_mmhg
-    from calibrate.posterior.predictions import prior_replicates
+    from calibrate.posterior.predictions import prior_replicates, shortfall
     from calibrate.project import model_before_data
     from emulator.core.store import save_arrays
 
@@ -100,6 +102,10 @@ def _prior(arguments: Namespace) -> Answer:
     problem = problem_of(arguments)
     run, model = problem.run, model_before_data(problem, progress=not arguments.json)
     replicates = prior_replicates(model, jax.random.key(run.seed))
+    found = len(replicates.draws[model.names[0]])
+    fewer = shortfall(found)
+    if not found:
+        raise InputError(fewer[0])
     units = {name: part.unit for name, part in model.observe.parts.items()}
     save_arrays(folder / "prior_predictive.safetensors", {**replicates.draws, **replicates.data})
     title = f"{run.scene}: what the prior predicts"
@@ -109,7 +115,9 @@ def _prior(arguments: Namespace) -> Answer:
         for name, v in replicates.data.items()
     }
     rows = [(f"{name} ({units[name]})", *quantiles.values()) for name, quantiles in result.items()]
-    text = table(("observation", "5 %", "50 %", "95 %"), rows)
+    text = "\n".join([table(("observation", "5 %", "50 %", "95 %"), rows), *fewer])
+    if fewer:
+        result["warnings"] = fewer
     if (band := _klotz(model, run.seed)) is not None:
         result["klotz"] = {"fraction": band.fraction, "band_kpa": band.band}
         text += (
