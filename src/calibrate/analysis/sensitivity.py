@@ -61,7 +61,7 @@ class Factors:
     Raises
     ------
     InputError
-        A group that names another's parameter, or an unknown one.
+        A group that names another's parameter, an unknown one, or all of them.
     """
 
     names: tuple[str, ...]
@@ -79,6 +79,11 @@ class Factors:
         for group in self.groups:
             if group in self.names:
                 raise InputError(f"group of parameters: '{group}' is a parameter's name")
+        if len(self.names) > len(self.labels) == 1:
+            raise InputError(
+                f"group of parameters: '{self.labels[0]}' has them all, so that nothing is left to "
+                "compare it with; leave one out"
+            )
 
     @cached_property
     def group_of(self) -> tuple[str, ...]:

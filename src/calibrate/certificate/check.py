@@ -42,7 +42,7 @@ from calibrate.samplers.diagnostics import effective, normalised
 from calibrate.samplers.laplace import MISSED_AT, MISSED_BY
 from calibrate.statistical_model import FEMLikelihood
 from emulator.core.display import counting
-from emulator.core.errors import InputError
+from emulator.core.errors import InputError, check_arguments
 from emulator.fem import Simulator
 from emulator.fem.campaign import executor
 
@@ -153,6 +153,7 @@ def certify(posterior: Posterior, simulator: Simulator, **options: Any) -> Certi
 
     ``options`` are those of :func:`examine`.
     """
+    check_arguments(options, "certify", examine)
     return examine(posterior, simulator, **options).certificate
 
 
@@ -224,6 +225,7 @@ def reweight(
         As :func:`examine`; or the verdict is neither ``accepted`` nor ``reweight``, so that nothing
         says the reweighted posterior is FEM's.
     """
+    check_arguments(options, "reweight", examine)
     return reweighted(examine(posterior, simulator, seed=seed, **options), seed=seed)
 
 

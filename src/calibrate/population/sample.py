@@ -27,6 +27,7 @@ from calibrate.samplers.checkpoint import Checkpoint, identity_of
 from calibrate.samplers.nuts import NUTS
 from calibrate.samplers.protocol import Context
 from calibrate.statistical_model import Data, Model
+from emulator.core.errors import check_arguments
 
 _PRIOR_DRAWS = 2000
 # The spread of few members may be near 0, where steps have to be short (docs/experiments.md,
@@ -68,6 +69,7 @@ def hierarchy(
         Members that do not fit each other, data that does not fit a member, an unknown sampler or
         the options of another.
     """
+    check_arguments(population, "hierarchy", hierarchy, population_model)
     checked = {
         m: (model, None) if y is None else model.given(y) for m, (model, y) in members.items()
     }

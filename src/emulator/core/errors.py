@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from difflib import get_close_matches
+from inspect import signature
+from typing import Any
 
 
 class InputError(ValueError):
@@ -31,6 +33,17 @@ def check_known(name: object, known: Iterable[str], noun: str) -> None:
     if name not in known:
         names = ", ".join(filter(None, known)) or "none"
         raise InputError(f"{noun} '{name}' is unknown; known: {names}{closest(name, known)}")
+
+
+def check_arguments(options: Iterable[str], what: str, *functions: Callable[..., Any]) -> None:
+    """Raise :class:`InputError` for an option that none of ``functions`` takes by its name alone.
+
+    what : the function that the user called; it begins the message.
+    """
+    parameters = [each for f in functions for each in signature(f).parameters.values()]
+    known = dict.fromkeys(each.name for each in parameters if each.kind is each.KEYWORD_ONLY)
+    for option in options:
+        check_known(option, known, f"{what}: option")
 
 
 def look_up[T](entries: Mapping[str, T], name: object, noun: str) -> T:

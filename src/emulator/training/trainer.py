@@ -93,6 +93,8 @@ def train(
     folder = Path(folder)
     if campaign is not None and not (plan.runs or resume):
         raise InputError(f"training: recipe '{plan.recipe}' takes no FEM runs, so no campaign")
+    if architecture is not None and not (plan.trains_network or resume):
+        raise InputError(f"training: recipe '{plan.recipe}' trains no network, so no architecture")
     session = Session(folder / CHECKPOINT, scene.fingerprint, plan, architecture)
     if resume:
         kinds = {name: type(each) for name, each in RECIPES.items()}

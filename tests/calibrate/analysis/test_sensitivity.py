@@ -124,6 +124,11 @@ def test_other_methods_in_words(method: str, capsys: pytest.CaptureFixture[str])
         (["--observe", "nodes:4", "--samples", "10"], "a power of two"),
         (["--observe", "nodes:4", "--group", "mu"], "write NAME=A,B"),
         (["--observe", "nodes:4", "--group", "all=mu,x"], "'x' is none of mu, lam"),
+        (["--observe", "nodes:4", "--group", "all=mu,lam"], "'all' has them all, so that nothing"),
+        (
+            ["--observe", "nodes:4", "--group", "all=mu,lam", "--method", "morris"],
+            "'all' has them all, so that nothing",
+        ),
     ],
 )
 def test_bad_words(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:

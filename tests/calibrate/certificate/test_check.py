@@ -262,6 +262,14 @@ def test_certify_refuses_what_makes_no_sense(beam, cube, fem, data):
         cal.certify(posterior, LinearSimulator(fem), at_most=100)
 
 
+@pytest.mark.parametrize("function", [cal.certify, cal.reweight])
+def test_a_misspelt_option_is_told_in_one_line(beam, fem, data, function):
+    found = exact_posterior(linear_model(beam), data)
+    message = f"{function.__name__}: option 'at_mots' is unknown; known: draws, at_most, mesh, "
+    with pytest.raises(InputError, match=f"{message}.*did you mean 'at_most'"):
+        function(found, fem, draws=50, at_mots=100)
+
+
 @pytest.mark.slow
 def test_a_posterior_survives_the_disk(beam, tmp_path):
     forward = linear_forward(beam)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray as xr
 
 import emulator as em
 from calibrate.measurements import (
@@ -247,3 +248,34 @@ def test_files_that_are_wrong(ventricle, tmp_path, text, message):
     (tmp_path / "d.csv").write_text(text)
     with pytest.raises(InputError, match=message):
         read_measurements(ventricle, tmp_path / "d.csv")
+
+
+@pytest.mark.parametrize(
+    ("arrays", "said"),
+    [
+        ({"E_circ": 6, "E_rad": 5}, "6 points have 5 strains 'E_rad'"),
+        ({"E_circ": 4, "E_rad": 6}, "6 points have 4 strains 'E_circ'"),
+        ({"E_circ": 5, "E_rad": 5}, "6 points have 5 strains 'E_circ'"),
+        ({"E_circ": (), "E_rad": 6}, "6 points have 1 strains 'E_circ'"),
+        ({"segment": 3, "mean_E_circ": 3, "mean_E_rad": 2}, "3 points have 2 strains 'mean_E_rad'"),
+        ({"segment": (3, 3), "mean_E_circ": 3}, "'segment' has shape (3, 3); expected (d,)"),
+        ({"segment": (), "mean_E_circ": 1}, "'segment' has shape (); expected (d,)"),
+        (
+            {"position_strain": (6, 3, 3), "E_circ": 6},
+            "'position_strain' has shape (6, 3, 3); expected (d, 3)",
+        ),
+    ],
+)
+def test_netcdf_arrays_that_do_not_fit_are_told_in_one_line(ventricle, tmp_path, arrays, said):
+    arrays = {name: np.zeros(shape) for name, shape in arrays.items()}
+    if "E_circ" in arrays and "position_strain" not in arrays:
+        mesh = ventricle.mesh
+        arrays["position_strain"] = mesh.nodes[mesh.elements[:6]].mean(axis=1)
+    variables = {
+        name: ([f"{name}_{k}" for k in range(values.ndim)], values)
+        for name, values in arrays.items()
+    }
+    xr.Dataset(variables).to_netcdf(tmp_path / "d.nc", engine="h5netcdf")
+    with pytest.raises(InputError) as error:
+        read_measurements(ventricle, tmp_path / "d.nc")
+    assert str(error.value) == f"data file {tmp_path / 'd.nc'}: {said}"

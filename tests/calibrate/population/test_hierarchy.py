@@ -197,6 +197,11 @@ def test_a_file_of_something_else_is_refused(tmp_path, beam):
         ({"alone": "luck"}, "sampler 'luck' is unknown"),
         ({"options": 3}, "sampler 'nuts' takes NUTSOptions, not int"),
         ({"eta": 0.0}, "eta is 0.0; it must be above 0"),
+        (
+            {"shard": ("mu",)},
+            "hierarchy: option 'shard' is unknown; known: options, alone, seed, progress, shared, "
+            "median, spread, eta; did you mean 'shared'?",
+        ),
         ({"spread": {"mu": -1.0}}, "spread of 'mu' is -1.0; give a number above 0"),
         ({"spread": {"kappa": 1.0}}, "spread of 'kappa'; shared: mu, lam"),
         ({"median": {"mu": dist.Uniform(1.0, 2.0)}}, "lies outside 50 to 100"),

@@ -127,6 +127,9 @@ def test_what_cannot_be_started_from(beam, other, cube, start, tmp_path):
     nothing = "'once_clamped_beam' has no network to start from, only taylor . discrepancy"
     refused(other, PLAN, nothing, start=em.load("once_clamped_beam"))
     refused(other, recipe("mechanics"), "recipe 'mechanics' trains no network")
+    for name in ("mechanics", "two_meshes", "family", "sweeps"):
+        message = f"recipe '{name}' trains no network, so no architecture"
+        refused(other, recipe(name), message, SMALL, None)
     clamped = em.Support("right", np.array([0.0, 0.0, -0.1]))
     moved = replace(other, supports=(*other.supports, clamped))
     refused(moved, PLAN, "has 6 features a node, 'once_clamped_beam' has 9")
