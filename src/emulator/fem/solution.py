@@ -66,16 +66,20 @@ class Solution(NamedTuple):
         """Whether each status is CONVERGED; bool of the status' shape."""
         return self.status == Status.CONVERGED
 
-    def require_converged(self, what: str = "simulation") -> Solution:
-        """Return itself, or raise :class:`~emulator.core.errors.SolverError` naming the failure."""
+    def require_converged(self, what: str = "simulation", limit: str | None = None) -> Solution:
+        """Return itself, or raise :class:`~emulator.core.errors.SolverError` naming the failure.
+
+        what : the name of the solve in the message.
+        limit : the words for how far it came, for numbers of one solve.
+        """
         status = np.atleast_1d(np.asarray(self.status)).ravel()
         failures = np.flatnonzero(status != Status.CONVERGED)
         if failures.size:
             load_factor = float(np.atleast_1d(np.asarray(self.load_reached)).ravel()[failures[0]])
             position = f" {failures[0]} of {status.size}" if status.size > 1 else ""
+            limit = limit or f"converged up to {100 * load_factor:.3g} % of it"
             raise SolverError(
-                f"{what}{position}: {Status(int(status[failures[0]])).text} "
-                f"(converged up to {100 * load_factor:.3g} % of it)"
+                f"{what}{position}: {Status(int(status[failures[0]])).text} ({limit})"
             )
         return self
 

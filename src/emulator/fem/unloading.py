@@ -36,7 +36,7 @@ import numpy as np
 from emulator.core.errors import InputError, look_up
 from emulator.core.machine import require_float64
 from emulator.fem.assembly import System
-from emulator.fem.compiled import compiled, while_loop
+from emulator.fem.compiled import while_loop
 from emulator.fem.derivatives import (
     Equations,
     RootFinder,
@@ -73,6 +73,7 @@ class Unloaded:
     status, iterations, factorisations, residual, load_reached : as in a
         :class:`~emulator.fem.solution.Solution`.
     loaded : the scene on the loaded mesh.
+    theta : the parameters (p,), with the loads that the mesh is under.
     """
 
     displacement: jax.Array
@@ -82,6 +83,7 @@ class Unloaded:
     residual: jax.Array
     load_reached: jax.Array
     loaded: Scene
+    theta: jax.Array
 
     @property
     def converged(self) -> jax.Array:
@@ -108,14 +110,35 @@ class Unloaded:
         """
         return scene_at_rest(self.loaded, self.require_converged().displacement)
 
+    @property
+    def taken_off(self) -> dict[str, tuple[float, str]]:
+        """Amount and unit of each load that was taken off, by its name; for numbers."""
+        values, share = self.loaded.resolve(self.theta), float(self.load_reached)
+        return {
+            (*load.quantities, load.magnitude)[0].name: (
+                share * float(load.value(values)),
+                load.magnitude.unit,
+            )
+            for load in self.loaded.loads
+            if load.magnitude is not None
+        }
+
+    @property
+    def limit(self) -> str:
+        """How much of the load could be taken off, in words; for numbers."""
+        amounts = ", ".join(f"{name} {x:.3g} {unit}" for name, (x, unit) in self.taken_off.items())
+        of_it = f" ({amounts})" if amounts else ""
+        return f"up to {100.0 * self.load_reached:.3g} % of the load{of_it} could be taken off"
+
     def require_converged(self, what: str = "unloading") -> Unloaded:
         """Return itself, or raise :class:`~emulator.core.errors.SolverError` naming the failure."""
-        Solution(*(getattr(self, name) for name in Solution._fields)).require_converged(what)
+        limit = self.limit if self.status.ndim == 0 else None
+        Solution(*(getattr(self, name) for name in Solution._fields)).require_converged(what, limit)
         return self
 
 
 jax.tree_util.register_dataclass(
-    Unloaded, data_fields=list(Solution._fields), meta_fields=["loaded"]
+    Unloaded, data_fields=[*Solution._fields, "theta"], meta_fields=["loaded"]
 )
 
 
@@ -177,7 +200,8 @@ class Unloader:
         theta = jnp.asarray(theta, dtype=float)
         require_shape(self.scene, "theta", theta, (len(self.scene.parameters),))
         solution = self._solution(theta, jnp.zeros(self.scene.held.shape))
-        return Unloaded(**jax.block_until_ready(solution)._asdict(), loaded=self.scene)
+        solution = jax.block_until_ready(solution)
+        return Unloaded(**solution._asdict(), loaded=self.scene, theta=theta)
 
     def sensitivities(self, unloaded: Unloaded, theta: jax.Array) -> jax.Array:
         """Return the derivatives (p, n, 3) of ``unloaded.displacement`` in each entry of ``theta``.
@@ -229,8 +253,7 @@ def _by_inverse_motion(
 ) -> Solution:
     """Solve the equations of inverse motion from ``start``, which is the loaded mesh."""
     without_stress_iterates = replace(options, stress_iterates=False)
-    solution = find_equilibrium(system, without_stress_iterates, theta, start)
-    return _check_corners(system, solution)
+    return find_equilibrium(system, without_stress_iterates, theta, start)
 
 
 def _by_fixed_point(
@@ -276,8 +299,7 @@ def _by_fixed_point(
     converged = state.loaded.converged
     w = jnp.where(converged, state.w, 0.0)
     residual, load_reached = system.relative_residual(w, theta), jnp.where(converged, 1.0, 0.0)
-    solution = state.loaded._replace(displacement=w, residual=residual, load_reached=load_reached)
-    return _check_corners(system, solution)
+    return state.loaded._replace(displacement=w, residual=residual, load_reached=load_reached)
 
 
 class _FixedPointState(NamedTuple):
@@ -296,20 +318,6 @@ class _FixedPointState(NamedTuple):
     relaxation: jax.Array
     corrections: jax.Array
     loaded: Solution
-
-
-@compiled
-def _check_corners(system: System, solution: Solution) -> Solution:
-    """Return ``solution``, failed if an element of the stress-free mesh is inverted at its corners.
-
-    A quadratic element may be inverted there and not at its quadrature points.
-    """
-    mesh = system.scene.mesh
-    corners = (mesh.nodes + solution.displacement)[mesh.corners]
-    volumes = jax.vmap(determinant)(corners[:, 1:] - corners[:, :1])
-    inverted = solution.converged & ~(jnp.min(volumes) > 0.0)
-    status = jnp.where(inverted, Status.INVERTED_ELEMENT, solution.status)
-    return solution._replace(status=status.astype(solution.status.dtype))
 
 
 METHODS: dict[str, RootFinder] = {"inverse": _by_inverse_motion, "fixed_point": _by_fixed_point}

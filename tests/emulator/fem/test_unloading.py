@@ -1,5 +1,6 @@
 """Unloading: loading what it finds leads back; two methods agree; derivatives; failures named."""
 
+import re
 from dataclasses import replace
 
 import jax
@@ -8,9 +9,14 @@ import numpy as np
 import pytest
 
 import emulator as em
+from calibrate.cli import main
+from cli_support import answer
 from emulator.core.errors import InputError, SolverError
 from emulator.fem.solution import Status
+from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.geometry.generators.sphere import sphere_octant
+from emulator.geometry.io import write_mesh
+from emulator.geometry.mesh import signed_volumes
 from emulator.mechanics.laws.neo_hookean import bulk_modulus
 from emulator.scenes.loads import KPA_PER_MMHG, Force
 from emulator.verify.incompressible import INNER, MU, OUTER, pressure_at, sphere_scene
@@ -179,11 +185,60 @@ def test_failures_have_names(unloader, ventricle):
         Status.LOAD_LIMIT, Status.INVERTED_ELEMENT, Status.ITERATION_LIMIT,
     )  # fmt: skip
     assert np.isfinite(crushed.displacement).all()
-    with pytest.raises(SolverError, match="unloading: .*converged up to"):
+    with pytest.raises(SolverError, match="unloading: .*up to 0 % of the load .pressure 0 kPa. c"):
         crushed.scene  # noqa: B018
     nowhere = unloader.solve(ventricle.centre.at[0].set(jnp.nan))
     assert Status(int(nowhere.status)) is Status.INVALID_INPUT
     assert np.isfinite(nowhere.displacement).all()
+
+
+SOFT = """
+law = "neo_hookean"
+mesh = "lv.vtu"
+[[supports]]
+node_set = "base"
+[[loads]]
+kind = "cavity_pressure"
+facet_set = "endocardium"
+parameter = "pressure"
+[parameters.mu]
+unit = "kPa"
+range = [0.5, 20]
+[parameters.pressure]
+unit = "kPa"
+range = [0, 200]
+[constants]
+lam = 30.0
+"""
+
+
+def test_how_much_of_a_load_that_is_too_high_could_be_taken_off(tmp_path, capsys):
+    write_mesh(tmp_path / "lv.vtu", human_ventricle(4, 8, 1))
+    (tmp_path / "lv.toml").write_text(SOFT)
+    words = ["unload", tmp_path / "lv.toml", "--theta", "mu=1", "pressure=150"]
+    code, result = answer(capsys, *words)
+    assert (code, result["status"]) == (1, "load_limit")
+    assert 0.0 < result["load_reached"] < 0.1
+    assert result["taken_off"] == {"pressure": 150.0 * result["load_reached"]}
+    assert main(list(map(str, words))) == 1
+    share, amount = 100.0 * result["load_reached"], result["taken_off"]["pressure"]
+    line = f"up to {share:.3g} % of the load (pressure {amount:.3g} kPa) could be taken off"
+    assert capsys.readouterr().out.splitlines()[1] == line
+    scene = em.find_scene(str(tmp_path / "lv.toml"))
+    most = em.unload(scene, scene.theta(mu=1.0, pressure=150.0))
+    with pytest.raises(SolverError, match=re.escape(line)):
+        most.require_converged()
+    assert em.unload(scene, jnp.array([1.0, amount])).converged
+
+
+@pytest.mark.slow
+def test_corners_that_would_invert_limit_the_load():
+    scene = em.scenes.left_ventricle(4, 8, 1)
+    most = em.unload(scene, jnp.array([0.2, 1.0, 3.0, 1.0, 100.0]))
+    assert Status(int(most.status)) is Status.INVERTED_ELEMENT
+    assert 0.0 < most.load_reached < 1.0
+    mesh = scene.mesh
+    assert signed_volumes(mesh.nodes + most.displacement, mesh.corners).min() > 0.0
 
 
 REFUSED = [

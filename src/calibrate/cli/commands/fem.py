@@ -117,7 +117,8 @@ _TOLERANCE = 1e-6  # largest distance of mesh and reloaded shape, in sizes of th
     ),
     help="the stress-free shape of a mesh that is known under load",
     description="Takes the scene's mesh for the shape under the loads of theta, as a mesh made "
-    "from an image is, finds the shape without them, and loads that again from rest.",
+    "from an image is, finds the shape without them, and loads that again from rest. Where "
+    "there is none, it says how much of the load could be taken off.",
     epilog="example: calibrate unload ventricle.toml --theta a=0.3 pressure=1.2 --out unloaded",
 )
 def unload(arguments: Namespace) -> Answer:
@@ -136,7 +137,8 @@ def unload(arguments: Namespace) -> Answer:
     unloaded = Unloader(scene).solve(theta)
     result, line = _solved(scene, theta, unloaded)
     if not unloaded.converged:
-        return Answer(result, line, usable=False)
+        result["taken_off"] = {name: amount for name, (amount, _) in unloaded.taken_off.items()}
+        return Answer(result, f"{line}\n{unloaded.limit}", usable=False)
     rest, start = unloaded.scene, np.asarray(unloaded.start)
     reloaded = Simulator(rest).solve(theta)
     status = Status(int(reloaded.status))
