@@ -10,11 +10,10 @@ from emulator.core.errors import InputError
 from emulator.released.scenes import published_scene
 from emulator.scenes.built_in import BUILT_IN
 from emulator.scenes.file import read_scene
-from emulator.scenes.finer import FINER, Finer, finer
+from emulator.scenes.finer import CHANGES, FINER, Finer, finer
 from emulator.scenes.scene import Scene
 
 _RELEASED = "published:"
-_FINER = f"{FINER}:"
 
 
 def find_scene(name: str, root: str | Path | None = None) -> Scene:
@@ -23,7 +22,8 @@ def find_scene(name: str, root: str | Path | None = None) -> Scene:
     Parameters
     ----------
     name : a built-in scene, a ``.toml`` file, or ``published:<Model>``; ``finer:`` before any of
-        them is that scene on the next finer mesh of its body.
+        them is that scene on the next finer mesh of its body, ``wider:`` the scene with ranges of
+        its parameters that are wider by half on each side.
     root : folder of the published data, for a published model.
 
     Raises
@@ -31,8 +31,9 @@ def find_scene(name: str, root: str | Path | None = None) -> Scene:
     InputError
         No such scene or file.
     """
-    if name.startswith(_FINER):
-        return finer(find_scene(name.removeprefix(_FINER), root)).scene
+    word, _, of = name.partition(":")
+    if of and word in CHANGES:
+        return CHANGES[word](find_scene(of, root))
     if name.startswith(_RELEASED):
         if root is None:
             raise InputError(f"scene '{name}': say where the published data is with --root DIR")
@@ -42,7 +43,8 @@ def find_scene(name: str, root: str | Path | None = None) -> Scene:
     if name not in BUILT_IN:
         raise InputError(
             f"scene '{name}' is unknown; built in: {', '.join(sorted(BUILT_IN))}; "
-            "or give a .toml file, or published:<Model> with --root DIR; finer:SCENE refines"
+            "or give a .toml file, or published:<Model> with --root DIR; finer:SCENE refines, "
+            "wider:SCENE widens ranges"
         )
     return BUILT_IN[name]()
 
@@ -51,8 +53,8 @@ def scene_from_origin(origin: Mapping[str, Any]) -> Scene:
     """Return the scene that ``origin``, plain JSON, describes; ``Scene.origin`` is one."""
     options = dict(origin)
     name = options.pop("scene", None)
-    if name == FINER:
-        return finer(scene_from_origin(options["of"])).scene
+    if name in CHANGES:
+        return CHANGES[name](scene_from_origin(options["of"]))
     if name == "file":
         return read_scene(options["path"])
     if isinstance(name, str) and name.startswith(_RELEASED):

@@ -47,6 +47,8 @@ def row(case, problem, simulator, budget, *, nuts=False, at_most=None) -> dict[s
     if nuts and case.sampled:
         data = posterior.data["displacement"]
         posterior = cal.sample(posterior.model, data, options=NUTS, seed=case.seed)
+    if posterior.model.full.scene is not problem.scene:  # in a box of its own
+        simulator = ExactSimulator(posterior.model.full)
     certificate = certify(
         posterior, simulator, draws=budget or case.budget, at_most=at_most, seed=case.seed
     )

@@ -44,7 +44,8 @@ class Case:
     @property
     def sampled(self):
         """Whether the map or the noise is what is wrong, and not the draws."""
-        return self.kind not in ("few", "stuck", "two_points")
+        kinds = ("few", "stuck", "two_points", "box_cuts", "box_touches")
+        return self.kind not in kinds
 
     @property
     def name(self):
@@ -70,7 +71,9 @@ def with_map(problem, error, seed, *, noise=1.0, draws=None):
     # The closed form has a flat prior.
     flat = {p.name: dist.Uniform(p.low, p.high) for p in problem.scene.parameters}
     prior = None if problem.steps else flat
-    model = cal.model(wrong, observe, cal.GaussianNoise(sd=used), prior)
+    # The truth is the posterior in this box.
+    bounded = problem.scene.parameter_names if problem.steps else ()
+    model = cal.model(wrong, observe, cal.GaussianNoise(sd=used), prior, bounded=bounded)
     if problem.steps:
         points, predictions = problem.grid()
         truth = moments_of(by_quadrature(problem, predictions, data, problem.noise), points)
@@ -231,6 +234,39 @@ def two_points(problem, size, seed):  # noqa: ARG001 - as every case
     return posterior_of(posterior.model, posterior.data["displacement"], moved), truth
 
 
+def box_cuts(problem, size, seed):
+    """FEM's map in a box whose ends are ``size`` sd above the best values of 1 to 3 parameters.
+
+    The truth is the posterior without a box, which is only a guess.
+    """
+    rng, data = np.random.default_rng([10, seed]), problem.data(seed)
+    mean, covariance = gaussian(problem, problem.forward, data, problem.noise)
+    sd = np.sqrt(np.diag(covariance))
+    low, high = mean - 12.0 * sd, mean + 12.0 * sd
+    ended = rng.permutation(len(sd))[: 1 + seed % 3]
+    upper = rng.random(len(sd)) < 0.5
+    for k in ended:
+        (high if upper[k] else low)[k] = mean[k] + (size if upper[k] else -size) * sd[k]
+    chosen = np.zeros((0, len(sd)))
+    while len(chosen) < DRAWS:
+        draws = rng.multivariate_normal(mean, covariance, size=100 * DRAWS)
+        inside = ((draws > low) & (draws < high)).all(axis=1)
+        chosen = np.concatenate([chosen, draws[inside]])[:DRAWS]
+    parameters = tuple(
+        replace(p, low=float(a), high=float(b), scale="uniform")
+        for p, a, b in zip(problem.scene.parameters, low, high, strict=True)
+    )
+    exact = replace(problem.forward, scene=replace(problem.scene, parameters=parameters))
+    observe = cal.nodal_displacements(exact.scene, problem.nodes)
+    model = cal.model(exact, observe, cal.GaussianNoise(sd=problem.noise))
+    return posterior_of(model, data, chosen), (mean, sd)
+
+
+def box_touches(problem, size, seed):
+    """The same, called by another name: a box that ends in the tail changes little."""
+    return box_cuts(problem, size, seed)
+
+
 def few(problem, size, seed):
     """``size`` draws in four chains; above 100 they are correlated by 0.98 from one to the next."""
     posterior, truth = with_map(problem, _nothing(problem), seed)
@@ -278,6 +314,8 @@ def cases(quick: bool = False) -> list[Case]:
     add(("modes",), constant, (0.0, 0.02), (0, 1), good_below=good)
     add(("hidden",), hidden_mode, (1.0, 5.0), tuple(range(8)))
     add(two, two_points, (1,), (0, 1, 2))
+    add(("five",), box_cuts, (0.2, 0.0, -0.5, -1.0, -1.5), tuple(range(6)))
+    add(("five",), box_touches, (1.5, 1.75, 2.0, 2.5, 3.0), tuple(range(6)), good_below=3.0)
     for budget in (50, 80):
         add(("beam", "modes"), hides, (1.0, 5.0), (0, 1), budget=budget)
         add(("hidden",), hidden_mode, (5.0,), tuple(range(8)), budget=budget)

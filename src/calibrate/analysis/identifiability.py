@@ -34,6 +34,7 @@ so that :math:`\dot W = \sigma : d` and :math:`d = \frac{\dot\lambda}{\lambda}\,
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -43,6 +44,8 @@ import numpy as np
 from scipy.linalg import eigh
 
 from calibrate.posterior import Posterior
+from calibrate.posterior.box import BoxEnd
+from calibrate.posterior.box import in_words as box_in_words
 from calibrate.priors import bounds
 from calibrate.samplers import density_of
 from calibrate.statistical_model import Model
@@ -70,6 +73,8 @@ def identify(posterior: Posterior) -> dict[str, Any]:
     correlation : first -> second -> correlation, posterior, on the parameters' scales.
     combinations : best known first, each with its ``exponents``, its relative sd ``known_to`` in
         the posterior and ``prior`` in the prior, without parameters whose range is not above 0.
+        Those with a parameter of ``box_ends`` are left out: its range made them narrow.
+    box_ends : the ends of ranges that end the posterior (:mod:`calibrate.posterior.box`).
     """
     model = posterior.model
     names, draws = model.states.unknowns, posterior.draws()
@@ -78,13 +83,17 @@ def identify(posterior: Posterior) -> dict[str, Any]:
     contraction = 1.0 - x.std(axis=0, ddof=1) / prior.std(axis=0, ddof=1)
     correlation = np.atleast_2d(np.corrcoef(x, rowvar=False))
     posterior_S, prior_S = (np.atleast_2d(np.cov(each, rowvar=False)) for each in (x, prior))
+    ends = posterior.box_ends()
+    cut = {end.name for end in ends}
+    known = combinations(model, posterior_S, prior_S, after.mean(axis=0))
     return {
         "contraction": dict(zip(names, contraction.tolist(), strict=True)),
         "correlation": {
             first: {second: float(correlation[j, k]) for k, second in enumerate(names)}
             for j, first in enumerate(names)
         },
-        "combinations": combinations(model, posterior_S, prior_S, after.mean(axis=0)),
+        "combinations": [entry for entry in known if not cut & set(entry["exponents"])],
+        "box_ends": [asdict(end) for end in ends],
     }
 
 
@@ -141,6 +150,8 @@ def in_words(result: dict[str, Any]) -> str:
         if abs(result["correlation"][first][second]) >= _TOGETHER
     ]
     lines.append(f"only known together: {', '.join(together) or 'none'}")
+    if result["box_ends"]:
+        lines.append(": ".join(box_in_words([BoxEnd(**end) for end in result["box_ends"]])))
     return "\n".join([*lines, *products_in_words(result["combinations"], _BEST)])
 
 

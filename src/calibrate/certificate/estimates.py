@@ -141,6 +141,7 @@ def evidence_of(
         tail_of(tests, missed, modes),
         misfits(pool.predictive, pool.correction, z, key_from(rng)),
         map_errors(pool.predictive, at_draws),
+        box=tuple(posterior.box_ends()),
     )
 
 

@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from calibrate.posterior.box import BoxEnd, in_words
 from calibrate.posterior.diagnosis import SMALLEST_P, Misfit, Sampling, map_fault, sampling_faults
 from emulator.core.display import TableRepr
 
@@ -151,7 +152,7 @@ class Physics:
     runs, failed : the numbers of runs, and of those that did not converge.
     failed_mass : the posterior mass on which FEM does not converge.
     smallest_J : the smallest det F in the body at any draw.
-    unstable, asked : the number of draws at which FEM is at a saddle, of the number examined.
+    unstable, asked : the numbers of draws at which FEM is at a saddle, and of those examined.
     """
 
     runs: int
@@ -198,6 +199,7 @@ class Evidence:
     map_errors : the distance of the map's data from FEM's at the draws, in noise sd, by
         observation; empty where the likelihood allows for it.
     mesh : the changes by a finer mesh.
+    box : the ends of ranges that end the posterior in place of the data.
     """
 
     draws: Changes
@@ -210,6 +212,7 @@ class Evidence:
     misfit: dict[str, Misfit]
     map_errors: dict[str, float] = field(default_factory=dict)
     mesh: MeshChange = MeshChange(why="not asked")
+    box: tuple[BoxEnd, ...] = ()
 
 
 Finding = tuple[str, str]
@@ -279,6 +282,7 @@ class Certificate(TableRepr):
                 "failed": e.mesh.failed,
                 "not_asked": e.mesh.why,
             },
+            "box": [asdict(end) for end in e.box],
             "misfit": {name: asdict(m) for name, m in e.misfit.items()},
             "map_errors": e.map_errors,
             **{name: asdict(getattr(e, name)) for name in ("sampling", "physics", "tail")},
@@ -304,7 +308,7 @@ def judge(evidence: Evidence) -> Certificate:
     Every comparison is written so that NaN fails it.
     """
     verdict, agreement = _agreement(evidence)
-    faults, others = list(sampling_faults(evidence.sampling)), list(_faults(evidence))
+    faults, others = list(sampling_faults(evidence.sampling, evidence.box)), list(_faults(evidence))
     wrong_map, agrees = map_fault(evidence.map_errors), verdict in ("accepted", "reweight")
     mesh_is_fine, mesh = _mesh(evidence.mesh)
     if faults or others or mesh_is_fine is False:
@@ -317,8 +321,8 @@ def judge(evidence: Evidence) -> Certificate:
     if evidence.mesh.why and verdict == "accepted":
         agreement = [(f"{agreement[0][0]} on this mesh", "")]
     findings = [*faults, *agreement, *mesh] if mesh_is_fine else [*faults, *mesh, *agreement]
-    in_words = tuple(": ".join(filter(None, finding)) for finding in findings)
-    return Certificate(verdict, findings[0][0], in_words, evidence)
+    sentences = tuple(": ".join(filter(None, finding)) for finding in findings)
+    return Certificate(verdict, findings[0][0], sentences, evidence)
 
 
 def _mesh(mesh: MeshChange) -> tuple[bool | None, list[Finding]]:
@@ -400,6 +404,8 @@ def _weights(tail: Tail) -> tuple[Verdict, list[Finding]] | None:
 def _faults(evidence: Evidence) -> Iterator[Finding]:
     """Yield what is wrong with FEM at the draws, and with the data, whatever FEM says of them."""
     p = evidence.physics
+    if evidence.box:
+        yield in_words(evidence.box)
     if not p.failed_mass <= LARGEST_FAILED:
         yield (
             f"FEM fails on {100 * p.failed_mass:.0f} % of the posterior",

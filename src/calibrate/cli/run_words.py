@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 NoiseWord = float | dict[str, Any]
 
 MODEL = (
-    "data", "truth", "known", "observe", "prior", "noise", "noise_scale", "discrepancy",
+    "data", "truth", "known", "observe", "prior", "bounded", "noise", "noise_scale", "discrepancy",
     "check_scale", "forward", "emulator", "error_runs", "mesh_error_runs", "load_steps",
 )  # fmt: skip
 """Fields of a run that say which posterior is meant, besides its scene (:func:`add_scene`) and the
@@ -227,6 +227,7 @@ WORDS = {
         "Holzapfel-Ogden parameters of human ventricles), or a population's medians, log sds and "
         "correlations in a .json file",
     ),
+    "bounded": Word("NAME", "parameters whose range ends where nature does", read=tuple),
     "noise": Word(
         "[NAME=]SD",
         "standard deviation by observation, e.g. volume=1.0 displacement=0.2, mL and mm; a bare "

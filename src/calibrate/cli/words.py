@@ -123,14 +123,15 @@ def add_scene(parser: ArgumentParser, more: str = "") -> None:
     parser.add_argument(
         "scene",
         metavar="SCENE",
-        help="built-in name, .toml file, or published:<Model>; finer:SCENE refines its mesh" + more,
+        help="built-in name, .toml file, or published:<Model>; finer:SCENE refines its mesh, "
+        "wider:SCENE widens its ranges" + more,
     )
     parser.add_argument("--root", metavar="DIR", help="folder of the published data")
 
 
 def scene_words(arguments: Namespace) -> tuple[str, str | None]:
     """Return the name and the folder (of published scenes) that :func:`add_scene` read."""
-    is_published = arguments.scene.removeprefix("finer:").startswith("published:")
+    is_published = "published:" in arguments.scene
     if arguments.root is not None and not is_published:
         raise InputError(
             f"--root has no effect with scene '{arguments.scene}': it is the folder of the "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,12 +16,14 @@ from calibrate.arviz import base
 from calibrate.population.density import PopulationDraws, density_of_population
 from calibrate.population.model import MEDIAN, SD, PopulationModel
 from calibrate.posterior import predictions, read_tree
+from calibrate.posterior.box import BoxEnd, box_ends
 from calibrate.posterior.diagnosis import diagnose, summary_of
 from calibrate.priors import Population, population_of_fits
 from calibrate.statistical_model import Model
 from emulator.core.display import TableRepr
 from emulator.core.errors import InputError, look_up
 from emulator.core.store import write_netcdf
+from emulator.scenes.parameter_space import Parameter
 
 ALONE, NEW, CORRELATION = "alone", "new_member", "correlation"
 PARAMETER, MEMBER = "parameter", "member"
@@ -157,7 +159,21 @@ class Hierarchy(TableRepr):
     def warnings(self) -> list[str]:
         """Return a sentence for each fault of the run, with what to do; empty if there is none."""
         statistics = {str(n): v.values for n, v in self.tree["sample_stats"].data_vars.items()}
-        return [*diagnose(self.draws(), statistics, self.summary(), {})]
+        return [*diagnose(self.draws(), statistics, self.summary(), {}, self.box_ends())]
+
+    def box_ends(self) -> list[BoxEnd]:
+        """Return the ends of ranges that end members' posteriors in place of the data."""
+        box = {}
+        for name in self.shared:
+            about = self.tree["posterior"][name].attrs
+            if "box" in about:
+                low, high = map(float, about["box"])
+                box[name] = Parameter(name, about["units"], low, high, about["scale"])
+        ends = []
+        for member in self.members:
+            found = box_ends(self.member(member), box)
+            ends += [replace(end, name=f"{end.name}[{member}]") for end in found]
+        return sorted(ends, key=lambda end: -end.shift)
 
     def save(self, path: str | Path) -> None:
         """Write the DataTree as netCDF, whole or not at all."""
@@ -212,6 +228,8 @@ def make_tree(
     for name, parameter in model.shared.items():
         for group in ("posterior", NEW):
             tree[group][name].attrs.update(units=parameter.unit or "1", scale=parameter.scale)
+        if all(name in member.boxed for member in model.members.values()):
+            tree["posterior"][name].attrs["box"] = [parameter.low, parameter.high]
     return tree
 
 

@@ -15,7 +15,7 @@ This costs no evaluation and trusts the forward map; a certificate's check
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import compress
 from typing import Any
@@ -24,6 +24,7 @@ import numpy as np
 import xarray as xr
 
 from calibrate.arviz import base, stats
+from calibrate.posterior.box import BoxEnd, in_words
 from calibrate.samplers import r_hat
 from calibrate.samplers.diagnostics import (
     ENOUGH_ESS,
@@ -66,8 +67,11 @@ class Sampling:
     vary: bool = True
 
 
-def sampling_faults(s: Sampling) -> Iterator[Fault]:
-    """Yield what makes draws useless for a certificate; NaN is at fault."""
+def sampling_faults(s: Sampling, box: Sequence[BoxEnd] = ()) -> Iterator[Fault]:
+    """Yield what makes draws useless for a certificate; NaN is at fault.
+
+    box : the ends of ranges that end the posterior, so that no prior is to be narrowed.
+    """
     if not s.vary:
         yield ("the draws of a parameter do not vary", "the sampler is stuck")
     elif not np.isfinite(s.r_hat):
@@ -77,8 +81,8 @@ def sampling_faults(s: Sampling) -> Iterator[Fault]:
     if not s.divergences <= max(LARGEST_DIVERGENT * s.transitions, 1):
         yield (
             f"{s.divergences} of {s.transitions} transitions diverged",
-            "the sampler cannot follow the posterior everywhere; raise target_accept, or narrow a "
-            "prior the data leaves open",
+            "the sampler cannot follow the posterior everywhere; raise target_accept"
+            + ("" if box else ", or narrow a prior the data leaves open"),
         )
     if s.vary and not np.min([s.ess_bulk, s.ess_tail]) >= REFUSE_BELOW_ESS:
         few = f"{s.ess_bulk:.0f} in the bulk and {s.ess_tail:.0f} in the tails"
@@ -129,6 +133,7 @@ def diagnose(
     statistics: Mapping[str, np.ndarray],
     summary: Mapping[str, Mapping[str, float]],
     attributes: Mapping[str, Any],
+    box: Sequence[BoxEnd] = (),
 ) -> Iterator[str]:
     """Yield a sentence for each thing that is wrong, with what to do; nothing if nothing is.
 
@@ -137,7 +142,10 @@ def diagnose(
     draws, statistics : the draws and the sampler's statistics by name, each (chains, draws).
     summary : the summary of each parameter, with ``r_hat``, ``ess_bulk`` and ``ess_tail``.
     attributes : the attributes of the run, e.g. ``pareto_k``.
+    box : the ends of ranges that end the posterior.
     """
+    if box:
+        yield ": ".join(in_words(box))
     if np.any(diverging := np.asarray(statistics.get("diverging", False), bool)):
         count, share = int(diverging.sum()), 100.0 * diverging.mean()
         clusters = [place for name, v in draws.items() if (place := _where(name, v, diverging))]
@@ -146,8 +154,12 @@ def diagnose(
             f"{count} divergent transitions of {diverging.size} ({share:.2g} %), "
             f"{f'mostly at {places}' if places else 'spread over the whole posterior'}: the "
             "posterior is too sharp or too curved there for the step size, and its part beyond may "
-            "be missing. Raise target_accept towards 1, give more warm-up, or use a prior that "
-            "leaves out what cannot be"
+            "be missing. Raise target_accept towards 1, "
+            + (
+                "or widen the box"
+                if box
+                else "give more warm-up, or use a prior that leaves out what cannot be"
+            )
         )
     r_hats = {name: row["r_hat"] for name, row in summary.items()}
     name = max(r_hats, key=lambda n: np.nan_to_num(r_hats[n], nan=np.inf))

@@ -18,6 +18,7 @@ import xarray as xr
 from calibrate.arviz import base
 from calibrate.measurements import Observation, Observations, missing_values
 from calibrate.posterior import predictions
+from calibrate.posterior.box import BoxEnd, box_ends
 from calibrate.posterior.diagnosis import diagnose, misfits, summary_of
 from calibrate.provenance import as_attributes, versions
 from calibrate.samplers import check_options, density_of, find_sampler, named_draws
@@ -124,10 +125,14 @@ class Posterior(TableRepr):
             for group in groups
         )
         attributes = {str(name): value for name, value in self.tree.attrs.items()}
-        faults = [*diagnose(draws, statistics, self.summary(), attributes)]
+        faults = [*diagnose(draws, statistics, self.summary(), attributes, self.box_ends())]
         if "prior" in self.tree.children:
             faults += predictions.shortfall(self.tree["prior"].sizes["draw"])
         return [*faults, *misfits(self.tree)]
+
+    def box_ends(self) -> list[BoxEnd]:
+        """Return the ends of ranges that end the posterior in place of the data, worst first."""
+        return box_ends(self.draws(), self.model.box)
 
     def save(self, path: str | Path) -> None:
         """Write the DataTree as netCDF, whole or not at all."""

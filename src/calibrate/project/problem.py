@@ -24,7 +24,7 @@ from calibrate.project.run import Run
 from calibrate.state_names import split
 from calibrate.statistical_model import Model, with_error
 from calibrate.statistical_model.errors import with_described_errors
-from calibrate.statistical_model.load_states import known_thetas, load_states
+from calibrate.statistical_model.load_states import boxed, known_thetas, load_states
 from calibrate.statistical_model.model import model
 from emulator.catalogue import find_scene
 from emulator.core.errors import InputError
@@ -117,7 +117,8 @@ def read_problem(run: Run | Problem, where: str = "", *, scene: Scene | None = N
                     )
             run = replace(run, known={**in_files, **run.known})
         run.noises(observe)
-        load_states(scene, observe.states, prior_of(run.prior, scene), run.known)
+        prior = prior_of(run.prior, scene)
+        boxed(load_states(scene, observe.states, prior, run.known)[0], prior, run.bounded)
         for name, description in run.systematic.items():
             words = dict.fromkeys(str(description["of"]).split("+"))
             observe.expand(words, f"systematic '{name}': of")
@@ -175,7 +176,15 @@ def build_forward(problem: Problem, *, progress: bool = False) -> ForwardMap:
 def model_of(run: Run, forward: ForwardMap, observe: Observations) -> Model:
     """Return the statistical model of a run, without the errors that depend on its data."""
     noises, prior = run.noises(observe), prior_of(run.prior, forward.scene)
-    return model(forward, observe, noises, prior, known=run.known, check_scale=run.check_scale)
+    return model(
+        forward,
+        observe,
+        noises,
+        prior,
+        known=run.known,
+        bounded=run.bounded,
+        check_scale=run.check_scale,
+    )
 
 
 def model_before_data(run: Run | Problem, *, progress: bool = False) -> Model:

@@ -21,6 +21,7 @@ from calibrate.state_names import split
 from calibrate.statistical_model import at_sites
 from emulator.core.errors import InputError
 from emulator.core.schema import read_json_as
+from emulator.scenes.finer import CHANGES
 from emulator.surrogates import registry, shipped
 
 if TYPE_CHECKING:
@@ -47,6 +48,8 @@ class Run:
         in every load state that ``truth`` and ``known`` name; ``volume@diastole`` in one.
     prior : ``box``, the name of a population of ``calibrate.priors.population.POPULATIONS``, or the
         fields of a :class:`calibrate.priors.Population`.
+    bounded : parameters whose range ends where nature does, as a share ends at 1; where a posterior
+        ends at the range of another one, data and not the range should end it.
     noise : standard deviation by the observation's name, in its unit, or a kind of
         :data:`calibrate.noise.NOISES` with its options, ``{"kind": "student_t", "dof": 4, "scale":
         0.2}``. A bare number belongs to a single observation, or to the displacements. An
@@ -86,6 +89,7 @@ class Run:
     known: dict[str, float] = field(default_factory=dict)
     observe: str = "nodes:20"
     prior: dict[str, Any] | str = "box"
+    bounded: tuple[str, ...] = ()
     noise: Mapping[str, float | dict[str, Any]] | float = field(default_factory=dict)
     noise_scale: Mapping[str, float] | float = field(default_factory=dict)
     discrepancy: Mapping[str, dict[str, Any]] = field(default_factory=dict)
@@ -210,8 +214,9 @@ def with_absolute_paths(entries: Mapping[str, Any], folder: Path = Path()) -> di
         return str((folder / word).resolve())
 
     def scene(word: str) -> str:
-        if word.startswith("finer:"):
-            return "finer:" + scene(word.removeprefix("finer:"))
+        change, _, of = word.partition(":")
+        if of and change in CHANGES:
+            return f"{change}:{scene(of)}"
         return path(word) if word.endswith(".toml") else word
 
     def data(word: str | dict[str, str]) -> str | dict[str, str]:

@@ -85,6 +85,26 @@ def load_states(
     return result, priors
 
 
+def boxed(
+    states: LoadStates, prior: Collection[str] | None, bounded: Collection[str]
+) -> frozenset[str]:
+    """Return the unknowns whose range stands for a prior, and may be a guess.
+
+    Parameters
+    ----------
+    prior : the names with a prior. bounded : the names whose range ends where nature does.
+
+    :class:`InputError` for a bounded parameter that is not inferred.
+    """
+    bases = {name: split(name)[0] for name in states.unknowns}
+    for name in bounded:
+        if name not in (*bases, *bases.values()):
+            inferred = ", ".join(states.unknowns)
+            raise InputError(f"bounded: '{name}' is not inferred; inferred: {inferred}")
+    named = {*(prior or ()), *bounded}
+    return frozenset(name for name, base in bases.items() if not {name, base} & named)
+
+
 def known_thetas(scene: Scene, states: tuple[str, ...], values: Mapping[str, float]) -> jax.Array:
     """Return theta (S, p) of states in which ``values`` names every parameter.
 

@@ -12,7 +12,7 @@ emulator with a correction, a reduced model or FEM.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -32,7 +32,7 @@ from calibrate.noise import Noise
 from calibrate.priors import Dependence, Prior, dependence_of
 from calibrate.priors.priors import Conditional
 from calibrate.state_names import split
-from calibrate.statistical_model.load_states import LoadStates, load_states
+from calibrate.statistical_model.load_states import LoadStates, boxed, load_states
 from calibrate.statistical_model.prior_range import check_known, fit_to, standardised
 from calibrate.whole_numpyro import mend_numpyro
 from emulator.core.errors import InputError
@@ -64,6 +64,8 @@ class Model:
     prior_cut : the mass of each prior that was cut off, by unknown (``prior_range``).
     check_scale : whether :meth:`check_data` refuses data far from every prediction.
     dependence : the dependence between the priors of some unknowns, in theta's order.
+    boxed : the unknowns whose prior is the scene's range for lack of another one, so that its ends
+        may be a guess (:mod:`calibrate.posterior.box`).
     """
 
     forward: ForwardMap
@@ -77,6 +79,7 @@ class Model:
     prior_cut: Mapping[str, float] = field(default_factory=dict)
     check_scale: bool = True
     dependence: Dependence | None = None
+    boxed: frozenset[str] = frozenset()
 
     # What is inferred, and its prior.
 
@@ -130,6 +133,11 @@ class Model:
         """Return the inverse of :meth:`on_scales`."""
         log = self.on_log_scale
         return jnp.where(log, jnp.exp(jnp.where(log, x, 0.0)), x)
+    @property
+    def box(self) -> dict[str, Parameter]:
+        """The parameter of each of :attr:`boxed`, in theta's order."""
+        named = zip(self.states.unknowns, self.parameters, strict=True)
+        return {name: parameter for name, parameter in named if name in self.boxed}
 
     @cached_property
     def sampled_priors(self) -> dict[str, dist.Distribution]:
@@ -339,6 +347,7 @@ def model(
     prior: Prior | None = None,
     *,
     known: Mapping[str, float] | None = None,
+    bounded: Collection[str] = (),
     check_scale: bool = True,
 ) -> Model:
     """Return the model of data observed through ``observe``.
@@ -352,15 +361,17 @@ def model(
         the loads' parameters have one prior for each state, or separate ones under ``pressure@p8``.
         A :class:`~calibrate.priors.JointPrior` correlates some.
     known : values of parameters that are not inferred, by the same names.
+    bounded : parameters whose range ends where nature does. The posterior of another one without a
+        prior carries a warning where it ends at the range's end.
     check_scale : ``False`` to take data however far from every prediction
         (:mod:`calibrate.measurements.magnitude`).
 
     Raises
     ------
     InputError
-        Noise that does not fit its observation, a prior that does not fit the scene, or one with
-        more than a thousandth of its mass where the forward map has no answer
-        (:mod:`calibrate.statistical_model.prior_range`).
+        Noise that does not fit its observation, a bounded parameter that is not inferred, a prior
+        that does not fit the scene, or one with more than a thousandth of its mass where the
+        forward map has no answer (:mod:`calibrate.statistical_model.prior_range`).
     """
     several = observations(observe)
     if not isinstance(noise, Mapping):
@@ -387,6 +398,7 @@ def model(
         prior_cut=cut,
         check_scale=check_scale,
         dependence=None if dependence is None else dependence.ordered(states.unknowns),
+        boxed=boxed(states, prior, bounded),
     )
 
 

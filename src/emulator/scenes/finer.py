@@ -1,7 +1,8 @@
-"""A scene on the next finer mesh of its body: law, loads, supports and parameters stay."""
+"""A scene on the next finer mesh of its body, or with wider ranges of its parameters."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +15,8 @@ from emulator.scenes.scene import Scene
 
 FINER = "finer"
 """The name under which the origin of a scene says that its mesh was refined."""
+WIDER = "wider"
+"""The name under which the origin of a scene says that the ranges of its parameters are wider."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,3 +93,17 @@ def _is_made_by(rule: FibreRule, scene: Scene) -> bool:
     except InputError:  # the mesh was replaced and lacks the rule's facet sets
         return False
     return fibres.shape == scene.fibres.shape and np.allclose(fibres, scene.fibres, atol=1e-9)
+
+
+def wider(scene: Scene) -> Scene:
+    """Return ``scene`` with every parameter's range wider by half of it on each side."""
+    parameters = tuple(parameter.wider() for parameter in scene.parameters)
+    origin = {"scene": WIDER, "of": dict(scene.origin)} if scene.origin else {}
+    return replace(scene, parameters=parameters, origin=origin)
+
+
+CHANGES: Mapping[str, Callable[[Scene], Scene]] = {
+    FINER: lambda scene: finer(scene).scene,
+    WIDER: wider,
+}
+"""What ``finer:SCENE`` and ``wider:SCENE`` are."""

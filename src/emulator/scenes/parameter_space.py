@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -68,6 +68,18 @@ class Parameter:
         """Return the derivative of :meth:`from_unit` at the position of ``value``."""
         span = self.high - self.low
         return value * math.log(self.high / self.low) if self.scale == "log" else 0.0 * value + span
+
+    def wider(self) -> Parameter:
+        """Return the parameter with a range wider by half on each side, on its scale.
+
+        A range above or from zero never reaches beyond zero.
+        """
+        if self.scale == "log":
+            factor = math.sqrt(self.high / self.low)
+            return replace(self, low=self.low / factor, high=self.high * factor)
+        half = 0.5 * (self.high - self.low)
+        least = 0.001 * self.low if self.low >= 0.0 else -math.inf
+        return replace(self, low=max(self.low - half, least), high=self.high + half)
 
     def to_json(self) -> dict[str, Any]:
         """Return the arguments of the constructor as plain JSON."""

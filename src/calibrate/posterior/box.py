@@ -1,0 +1,180 @@
+r"""Whether the ends of a box prior, and not the data, end a posterior.
+
+A parameter without a prior has its scene's range as one, a box. Often that range is a guess. Where
+the data want more than it allows, draws gather at its end, closer together than the data alone
+would have them: their sd says how near the end is, not what is known.
+
+Draws :math:`x_i` of the parameters with a box are taken as positions in it, 0 to 1 on each
+parameter's scale. The line through :math:`x_i` along a unit vector :math:`d` leaves the box after
+the distance :math:`t_i`: along an axis at the end of that range, along others also in a corner,
+where several ranges end together. Near the exit the distances have the density
+
+.. math:: p(t) \propto e^{-\alpha t - \beta t^2}, \qquad 0 \le t \le T
+
+with :math:`T` their 90 % quantile and :math:`\alpha, \beta` of maximum likelihood. Continued
+outwards, to :math:`t = -E`, it gives the mass beyond the exit, relative to that of the draws,
+
+.. math:: M = p(0) \int_0^E e^{\alpha r - \max(\beta, 0)\, r^2}\, dr .
+
+With the masses beyond both exits, and their centres :math:`m_\pm` along :math:`d`, the mean would
+move by
+
+.. math:: \Delta = \frac{M_+ (m_+ - \bar x) + M_- (m_- - \bar x)}{1 + M_+ + M_-}
+
+in a wider box: :math:`E` is three sd of the draws along :math:`d`, or where a box that is wider by
+half on each side ends (:meth:`Parameter.wider`). The directions are the axes and the principal axes of the draws. A posterior that is about as wide as the box along
+:math:`d` is left open by the data; it claims nothing there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import minimize
+
+from calibrate.state_names import split
+from emulator.scenes.parameter_space import Parameter
+
+LARGEST_SHIFT = 0.5  # posterior sd by which a wider box may move a mean: as for a finer mesh
+_OPEN = 0.8  # posterior sd over the box's, above which the data leave a direction open
+_NEAR = 0.9  # quantile of the distances up to which their density is fitted
+_FAR = 3.0  # posterior sd to which a density is continued, and the largest shift that is meant
+_OFTEN = 0.1  # share of the draws nearest to the exit that leave at an end which is named
+_STEEPEST = 50.0  # slope and curvature of the fitted log density, in units of 1 / T
+_NODES, _WEIGHTS = (0.5 * x for x in np.polynomial.legendre.leggauss(48))  # on -1/2 to 1/2
+_NODES += 0.5
+
+
+@dataclass(frozen=True)
+class BoxEnd:
+    """One end of a parameter's range that ends the posterior.
+
+    name : the unknown. value : the end of its range. unit : the unit of both.
+    shift : the change of the mean by a wider box, in posterior sd, at most 3.
+    """
+
+    name: str
+    value: float
+    unit: str
+    shift: float
+
+    def __str__(self) -> str:
+        """Return the end in words, such as ``a_f at 10.3 kPa``."""
+        return f"{self.name} at {self.value:.4g} {self.unit}".rstrip()
+
+
+def box_ends(draws: Mapping[str, np.ndarray], box: Mapping[str, Parameter]) -> list[BoxEnd]:
+    """Return the ends of ranges that end the posterior in place of the data, the worst first.
+
+    Parameters
+    ----------
+    draws : the draws (s,) of each unknown. box : the range of each unknown whose prior is a box.
+    """
+    names = [n for n in box if np.ptp(draws[n]) > 0.0]
+    if not names:
+        return []
+    x = np.stack([box[n].to_unit(jnp.ravel(draws[n])) for n in names], axis=1)
+    x = np.clip(x, 0.0, 1.0)
+    ranges = np.array([(box[n].wider().low, box[n].wider().high) for n in names])
+    wide = np.stack([box[n].to_unit(jnp.asarray(r)) for n, r in zip(names, ranges, strict=True)])
+    wider = np.abs(wide - [0.0, 1.0]).T
+    covariance = np.atleast_2d(np.cov(x, rowvar=False))
+    directions = np.vstack([np.eye(len(names)), np.linalg.eigh(covariance)[1].T])
+    worst: dict[tuple[int, bool], float] = {}
+    for d in directions:
+        sd = float(np.sqrt(d @ covariance @ d))
+        if not 0.0 < sd < _OPEN * np.sqrt((d**2).sum() / 12.0):
+            continue
+        up, down = (_exit(x, each, wider, _FAR * sd) for each in (d, -d))
+        shift = (up.mass * up.beyond - down.mass * down.beyond) / (1.0 + up.mass + down.mass)
+        if abs(shift) <= LARGEST_SHIFT * sd:
+            continue
+        for end in (up if shift > 0.0 else down).ends:
+            worst[end] = max(worst.get(end, 0.0), min(abs(shift) / sd, _FAR))
+    found = []
+    for (k, at_high), shift in sorted(worst.items(), key=lambda item: -item[1]):
+        parameter = box[names[k]]
+        value = parameter.high if at_high else parameter.low
+        found.append(BoxEnd(names[k], value, parameter.unit, shift))
+    return found
+
+
+@dataclass(frozen=True)
+class _Exit:
+    """What lies beyond the box along a direction.
+
+    mass : the mass relative to the draws'. beyond : the distance of its centre from their mean.
+    ends : the parameters' numbers, and whether it is their upper end, at which draws leave the box.
+    """
+
+    mass: float
+    beyond: float
+    ends: tuple[tuple[int, bool], ...]
+
+
+def in_words(ends: Sequence[BoxEnd]) -> tuple[str, str]:
+    """Return what the ends do to the posterior, and what to do about it, of one end or more."""
+    shift = max(end.shift for end in ends)
+    by = f"{shift:.1f} sd" if shift < 0.9 * _FAR else f"about {_FAR:.0f} sd or more"
+    # Without the load state, pressure@p8, and without the member of a population, mu[beam1].
+    names = " ".join(dict.fromkeys(split(end.name)[0].split("[")[0] for end in ends))
+    corner = "a corner of the box ends" if len(ends) > 1 else "the box ends"
+    return (
+        f"{corner} the posterior, not the data: {', '.join(map(str, ends))}; in a wider one means "
+        f"would move by {by}",
+        "widen the ranges and train there (calibrate train wider:SCENE), or say that nature ends "
+        f"there (--bounded {names})",
+    )
+
+
+def _exit(x: np.ndarray, d: np.ndarray, wider: np.ndarray, farthest: float) -> _Exit:
+    """Return what lies beyond the box along ``d`` (q,) from positions x (s, q).
+
+    wider : how far each lower and each upper side moves out, (2, q). farthest : how far at most.
+    """
+    moves = np.abs(d) > 1e-9
+    d, x = d[moves], x[:, moves]
+    high = d > 0.0
+    gap = np.where(high, 1.0 - x, x) / np.abs(d)
+    first = gap.argmin(axis=1)
+    t = gap[np.arange(len(x)), first]
+    extent = np.where(high, wider[1, moves], wider[0, moves]) / np.abs(d)
+    E = min(float(np.median((gap + extent).min(axis=1) - t)), farthest)
+    T = float(np.quantile(t, _NEAR))
+    if not (T > 0.0 and E > 0.0):
+        return _Exit(0.0, 0.0, ())
+    log_norm, alpha, beta = _fit(t[t <= T] / T)
+    r = E / T * _NODES
+    outside = np.exp(np.minimum(alpha * r - max(beta, 0.0) * r**2 - log_norm, _STEEPEST))
+    outside *= _WEIGHTS * E / T * _NEAR
+    mass = float(outside.sum())
+    near = t <= np.quantile(t, 1.0 - _NEAR)
+    share = np.bincount(first[near], minlength=len(d)) / near.sum()
+    numbers = np.flatnonzero(moves)
+    ends = tuple((int(numbers[k]), bool(high[k])) for k in np.flatnonzero(share >= _OFTEN))
+    # From the draws' mean to the exit where they leave, and on to the centre of what is outside.
+    to_exit = float(((x + t[:, None] * d) @ d)[near].mean() - (x @ d).mean())
+    return _Exit(mass, to_exit + float(outside @ r) * T / mass if mass else 0.0, ends)
+
+
+def _fit(t: np.ndarray) -> tuple[float, float, float]:
+    r"""Return the log norm, alpha and beta of :math:`e^{-\alpha t - \beta t^2}` on 0 to 1.
+
+    The likelihood of an exponential family is concave; its gradient is the difference of moments.
+    """
+    statistics = np.stack([_NODES, _NODES**2])
+    wanted = np.array([t.mean(), (t**2).mean()])
+
+    def negative(a: np.ndarray) -> tuple[float, np.ndarray]:
+        log = -a @ statistics
+        density = _WEIGHTS * np.exp(log - log.max())
+        norm = density.sum()
+        log_norm = float(np.log(norm) + log.max())
+        return a @ wanted + log_norm, wanted - statistics @ density / norm
+
+    bound = [(-_STEEPEST, _STEEPEST)] * 2
+    best = minimize(negative, np.zeros(2), jac=True, bounds=bound, method="L-BFGS-B").x
+    return negative(best)[0] - float(best @ wanted), float(best[0]), float(best[1])

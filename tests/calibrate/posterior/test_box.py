@@ -1,0 +1,134 @@
+"""Ends of ranges that end a posterior: draws of known distributions, cut, touched and open."""
+
+import numpy as np
+import pytest
+
+import calibrate as cal
+from calibrate.posterior.box import box_ends, in_words
+from calibrate.posterior.diagnosis import diagnose
+from emulator.core.errors import InputError
+from emulator.scenes.parameter_space import Parameter
+from linear_support import linear_forward
+
+RNG = np.random.default_rng
+
+
+def one(draws, low=1.0, high=2.0, scale="uniform"):
+    return box_ends({"a": draws}, {"a": Parameter("a", "kPa", low, high, scale)})
+
+
+def normal(mean, sd, count=4000, seed=0):
+    """Draws of a normal that is cut to the range 1 to 2."""
+    draws = mean + sd * RNG(seed).normal(size=400 * count)
+    return draws[(draws > 1.0) & (draws < 2.0)][:count]
+
+
+@pytest.mark.parametrize("inside", [-3.0, -1.0, 0.0, 0.3])
+@pytest.mark.parametrize("at_high", [True, False])
+def test_a_normal_that_is_cut_near_its_mode_ends_there(inside, at_high):
+    draws = normal(2.0 - 0.05 * inside, 0.05)
+    (end,) = one(draws if at_high else 3.0 - draws)
+    assert end.value == (2.0 if at_high else 1.0)
+    # The whole normal's mean against the cut one's; far outside only a lower bound is told.
+    exact = (2.0 - 0.05 * inside - draws.mean()) / draws.std()
+    assert end.shift == pytest.approx(min(exact, 3.0), rel=0.4)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("inside", [1.25, 1.5, 2.0, 3.0, 8.0])
+def test_a_tail_that_is_cut_is_no_end(inside, seed):
+    assert one(normal(2.0 - 0.05 * inside, 0.05, seed=seed)) == []
+
+
+def test_what_data_leave_open_claims_nothing():
+    assert one(RNG(0).uniform(1.0, 2.0, 4000)) == []
+    assert one(RNG(0).uniform(1.3, 1.7, 4000)) == []
+
+
+def test_half_of_the_range_that_is_left_open_ends_there():
+    (end,) = one(RNG(0).uniform(1.5, 2.0, 4000))
+    assert str(end) == "a at 2 kPa"
+
+
+def test_a_log_scale_counts_ratios():
+    draws = np.exp(np.log(100.0) * (normal(1.0 + 1.0, 0.05) - 1.0))
+    (end,) = one(draws, 1.0, 100.0, "log")
+    assert end.value == 100.0
+
+
+def test_zero_is_no_guess():
+    """A range from zero is not widened there."""
+    draws = np.abs(0.05 * RNG(0).normal(size=4000))
+    assert one(draws, 0.0, 1.0) == []
+    assert len(one(1.0 - draws, 0.0, 1.0)) == 1
+
+
+def test_a_corner_is_seen_where_no_side_is():
+    """Correlated by 0.98, with the mode in the corner: each density falls to half at its side."""
+    draws = RNG(0).multivariate_normal([0.0, 0.0], [[1.0, 0.98], [0.98, 1.0]], size=400_000)
+    draws = 2.0 + 0.05 * draws
+    draws = draws[((draws < 2.0) & (draws > 1.0)).all(axis=1)][:4000]
+    box = {name: Parameter(name, "", 1.0, 2.0) for name in "ab"}
+    ends = box_ends(dict(zip("ab", draws.T, strict=True)), box)
+    assert {(end.name, end.value) for end in ends} == {("a", 2.0), ("b", 2.0)}
+    words, remedy = in_words(ends)
+    assert words.startswith("a corner of the box ends the posterior, not the data: a at 2, b at 2")
+    assert "--bounded" in remedy
+    assert "wider:SCENE" in remedy
+
+
+def test_a_ridge_across_the_box_is_none_and_a_short_one_is():
+    box = {name: Parameter(name, "", 1.0, 2.0) for name in "ab"}
+    noise = 0.01 * RNG(1).normal(size=(2, 4000))
+    for length, is_cut in ((1.0, False), (0.2, True)):
+        along = RNG(0).uniform(0.0, length, 4000)
+        draws = np.stack([2.0 - length + along, 2.0 - along]) + noise
+        draws = draws[:, ((draws < 2.0) & (draws > 1.0)).all(axis=0)]
+        assert bool(box_ends({"a": draws[0], "b": draws[1]}, box)) == is_cut
+
+
+def test_degenerate_draws_have_no_ends():
+    assert one(np.full(100, 2.0)) == []
+    assert box_ends({"a": RNG(0).normal(size=100)}, {}) == []
+
+
+@pytest.fixture
+def model(beam):
+    return lambda **more: cal.model(
+        linear_forward(beam), cal.nodal_displacements(beam, [3, 11]), cal.GaussianNoise(sd=0.2), **more
+    )
+
+
+def test_a_range_is_a_box_unless_something_else_is_said(model, beam):
+    assert list(model().box) == ["mu", "lam"]
+    assert list(model(bounded=("mu",)).box) == ["lam"]
+    assert list(model(prior={"mu": cal.box_prior(beam)["mu"]}).box) == ["lam"]
+    assert list(model(known={"lam": 70.0}).box) == ["mu"]
+    with pytest.raises(InputError, match="bounded: 'nu' is not inferred; inferred: mu, lam"):
+        model(bounded=("nu",))
+
+
+def test_data_that_want_more_than_the_box_are_told(beam, model):
+    """Nearly noise-free data of a body softer than the range: a warning, unless nature ends there."""
+    exact = linear_forward(beam).at(np.array([3, 11]))(beam.centre.at[0].set(44.0))
+    options = cal.NUTSOptions(warmup=200, draws=300, chains=2, rounds=1)
+    for bounded in ((), ("mu", "lam")):
+        posterior = cal.sample(
+            model(bounded=bounded, check_scale=False), exact, options=options, predictions=False
+        )
+        said = [s for s in posterior.warnings() if "ends the posterior, not the data" in s]
+        assert bool(said) == (not bounded)
+        learned = cal.identify(posterior)
+        assert bool(learned["box_ends"]) == (not bounded)
+        if not bounded:
+            assert not any("mu" in entry["exponents"] for entry in learned["combinations"])
+
+
+def test_a_cut_posterior_is_not_advised_to_narrow_a_prior():
+    rng = RNG(0)
+    draws = {"a": rng.normal(size=(4, 100))}
+    diverging = {"diverging": rng.random((4, 100)) < 0.2}
+    row = {"a": {"r_hat": 1.0, "ess_bulk": 500.0, "ess_tail": 500.0}}
+    ends = one(normal(2.0, 0.05))
+    for box, words in ((ends, "widen the box"), ((), "a prior that leaves out")):
+        assert any(words in sentence for sentence in diagnose(draws, diverging, row, {}, box))
