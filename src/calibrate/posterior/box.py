@@ -21,9 +21,10 @@ move by
 
 .. math:: \Delta = \frac{M_+ (m_+ - \bar x) + M_- (m_- - \bar x)}{1 + M_+ + M_-}
 
-in a wider box: :math:`E` is three sd of the draws along :math:`d`, or where a box that is wider by
-half on each side ends (:meth:`Parameter.wider`). The directions are the axes and the principal axes of the draws. A posterior that is about as wide as the box along
-:math:`d` is left open by the data; it claims nothing there.
+in a wider box: :math:`E` is three sd of the draws along :math:`d`, or less where a box that is
+wider by half on each side ends (:meth:`Parameter.wider`). The directions are the axes and the
+principal axes of the draws. A posterior that is about as wide as the box along :math:`d` is left
+open by the data; it claims nothing there.
 """
 
 from __future__ import annotations

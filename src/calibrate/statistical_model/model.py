@@ -133,6 +133,7 @@ class Model:
         """Return the inverse of :meth:`on_scales`."""
         log = self.on_log_scale
         return jnp.where(log, jnp.exp(jnp.where(log, x, 0.0)), x)
+
     @property
     def box(self) -> dict[str, Parameter]:
         """The parameter of each of :attr:`boxed`, in theta's order."""

@@ -95,7 +95,10 @@ def test_degenerate_draws_have_no_ends():
 @pytest.fixture
 def model(beam):
     return lambda **more: cal.model(
-        linear_forward(beam), cal.nodal_displacements(beam, [3, 11]), cal.GaussianNoise(sd=0.2), **more
+        linear_forward(beam),
+        cal.nodal_displacements(beam, [3, 11]),
+        cal.GaussianNoise(sd=0.2),
+        **more,
     )
 
 
