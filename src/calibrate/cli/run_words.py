@@ -231,8 +231,8 @@ WORDS = {
     "noise": Word(
         "[NAME=]SD",
         "standard deviation by observation, e.g. volume=1.0 displacement=0.2, mL and mm; a bare "
-        "number is a single observation's or the displacements' (default 0.2 mm, 1 mL). Other "
-        "noise by its name, e.g. displacement=student_t:dof=4,scale=0.2 or "
+        "number is a single observation's or the displacements' (default 0.2 mm, 1 mL, less for a "
+        "small body). Other noise by its name, e.g. displacement=student_t:dof=4,scale=0.2 or "
         "displacement=correlated:length=15,sd=0.1,spatial_sd=0.2 (length in mm)",
         read=noise_words,
     ),

@@ -27,6 +27,10 @@ from calibrate.noise.protocol import Sites
 from emulator.core.errors import InputError
 from emulator.scenes.scene import Scene
 
+LARGEST_SHARE = 0.03
+"""The largest default standard deviation of noise as a share of what is observed of the body; the
+usual sd of every kind is below that for bodies of a few centimetres."""
+
 LENGTH_UNITS: Mapping[str, float] = {"m": 1e3, "cm": 10.0, "µm": 1e-3}
 """Units that lengths in mm may come in by mistake, each in mm."""
 
@@ -83,7 +87,8 @@ class Observation(ABC):
     quantity : the measured quantity, such as ``displacement``.
     unit : the unit of the data; ``1`` where it has none.
     other_units : units the data may be in by mistake, each with the factor that converts it.
-    usual_sd : the standard deviation of the noise where none is given; None if it must be given.
+    usual_sd : the standard deviation of the noise where none is given, unless the body is small
+        (:meth:`noise_in`); None if it must be given.
     positive : whether the number must be above 0.
     nodes : the nodes whose displacement it needs, (k,).
 
@@ -235,6 +240,16 @@ class Observation(ABC):
             name = self.names[0]
             raise InputError(f"{name} has no usual noise; give --noise {name}=SD, in {self.unit}")
         return GaussianNoise(sd=self.usual_sd)
+
+    def size_in(self, scene: Scene) -> float | None:
+        """Return the size of what is observed of the body at rest, in the data's unit, if any."""
+        return scene.mesh.size if self.unit == "mm" else None
+
+    def noise_in(self, scene: Scene) -> GaussianNoise:
+        """Return :attr:`default_noise`, no larger than a share of what is observed in ``scene``."""
+        noise, size = self.default_noise, self.size_in(scene)
+        largest = np.inf if size is None else LARGEST_SHARE * size
+        return noise if noise.upper_sd <= largest else GaussianNoise(sd=float(f"{largest:.2g}"))
 
     def _derive(self, **attributes: Any) -> None:
         """Set attributes that follow from the fields; for ``__post_init__``."""

@@ -60,6 +60,10 @@ class CavityVolume(Scalar):
         """``volume`` and ``volume:<facet set>``."""
         return self.kind, *super().names
 
+    def size_in(self, scene: Scene) -> float:
+        """Return the cavity's volume at rest, mL."""
+        return float(self.cavity.rest)
+
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the volume (...) in mL."""
         return self.cavity(displacement)

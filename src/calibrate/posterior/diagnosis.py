@@ -14,6 +14,7 @@ This costs no evaluation and trusts the forward map; a certificate's check
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,6 +23,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from scipy.linalg import eigvalsh
+from scipy.stats import ks_2samp
 
 from calibrate.arviz import base, stats
 from calibrate.posterior.box import BoxEnd, in_words
@@ -34,16 +37,24 @@ from calibrate.samplers.diagnostics import (
 )
 from calibrate.samplers.laplace import MISSED_AT, MISSED_BY
 
+# Attributes of a run: errors of the map at its draws (:func:`map_fault`), and sentences on noises
+# of its own choice, as JSON.
+MAP_ERRORS, SCALED_NOISE = "map_errors", "scaled_noise"
+
 SMALLEST_P = 0.005
 OUTLYING = 4.0  # sds, beyond which 0.6 % of sets of 100 Gaussian data have a datum
 LARGEST_MAP_ERROR = 0.5  # noise sd by which the forward map may miss FEM's data
 LARGEST_DIVERGENT = 0.002
-_FEWEST = 200  # replicates from which such a small p can be estimated
+MAP_FIRST = "mend the map first"  # the remedy of chains on a wrong map
+_FEWEST = 200  # replicates from which a small p, or a share of the prior's sd, can be estimated
 _LARGEST_K = 0.7  # Vehtari et al. (2024)
 _LOWEST_EFFICIENCY = 0.2
 _LOWEST_ACCEPTANCE = 0.1
 _MANY = 100.0
 _MARKED = 0.5  # standard deviations from which a shift of divergences is reported
+# Of a posterior that is the prior: least sd over the prior's, and largest difference of the
+# cumulative distributions. 500 draws of five unknowns from the same Gaussian have 0.85 and 0.1.
+_LITTLE_SD, _LITTLE_MOVED = 0.8, 0.15
 _NAMED = 3  # largest number of parameters that a sentence names
 
 
@@ -144,6 +155,10 @@ def diagnose(
     attributes : the attributes of the run, e.g. ``pareto_k``.
     box : the ends of ranges that end the posterior.
     """
+    yield from json.loads(attributes.get(SCALED_NOISE, "[]"))
+    wrong_map = map_fault(json.loads(attributes.get(MAP_ERRORS, "{}")))
+    if wrong_map is not None:
+        yield ": ".join(wrong_map)
     if box:
         yield ": ".join(in_words(box))
     if np.any(diverging := np.asarray(statistics.get("diverging", False), bool)):
@@ -166,16 +181,18 @@ def diagnose(
     if not np.isfinite(r_hats[name]):
         yield f"R-hat of {name} is not a number: too few draws, or draws that do not vary"
     elif r_hats[name] > WARN_ABOVE_R_HAT:
-        yield (
-            f"the chains disagree about {name}, R-hat {r_hats[name]:.3f}: run longer; if it stays, "
-            "there are several modes or a long ridge, for which sampler smc is made"
+        cure = (
+            "run longer; if it stays, there are several modes or a long ridge, for which sampler "
+            "smc is made"
         )
+        disagree = f"the chains disagree about {name}, R-hat {r_hats[name]:.3f}"
+        yield f"{disagree}: {cure if wrong_map is None else MAP_FIRST}"
     sizes = {n: min(row["ess_bulk"], row["ess_tail"]) for n, row in summary.items()}
     name = min(sizes, key=lambda n: sizes[n])
     if not sizes[name] >= ENOUGH_ESS:
         yield (
             f"{sizes[name]:.0f} effective draws of {name}, fewer than {ENOUGH_ESS:.0f}: quantiles "
-            "are uncertain; take more draws"
+            f"are uncertain; {'take more draws' if wrong_map is None else MAP_FIRST}"
         )
     if (rate := float(np.mean(statistics.get("accepted", 1.0)))) < _LOWEST_ACCEPTANCE:
         yield (
@@ -198,6 +215,31 @@ def diagnose(
             "all draws: use a sampler for several modes, such as smc, or a prior that leaves one "
             "of them out"
         )
+
+
+def nothing_learned(tree: xr.DataTree, unknowns: Sequence[str], noise: str) -> list[str]:
+    """Return a sentence if the posterior is about the prior; none with few draws of the prior.
+
+    Each unknown's distribution, and the sd of the best known linear combination, are compared.
+
+    noise : the noises of the data in words.
+    """
+    if tree["prior"].sizes["draw"] < _FEWEST:
+        return []
+    before, after = (
+        np.stack([np.ravel(tree[group][name]) for name in unknowns])
+        for group in ("prior", "posterior")
+    )
+    moved = max(ks_2samp(*rows).statistic for rows in zip(before, after, strict=True))
+    with np.errstate(invalid="ignore"):
+        sds = np.sqrt(eigvalsh(np.atleast_2d(np.cov(after)), np.atleast_2d(np.cov(before))))
+    if not (sds[0] >= _LITTLE_SD and moved <= _LITTLE_MOVED):
+        return []
+    return [
+        f"the data say next to nothing: what is known best keeps {100 * min(sds[0], 1.0):.0f} % of "
+        f"its prior sd. Their noise is {noise}: give your data's if it is smaller (--noise), or "
+        "observe more"
+    ]
 
 
 def _where(name: str, values: np.ndarray, diverging: np.ndarray) -> tuple[float, str] | None:

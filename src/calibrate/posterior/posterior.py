@@ -19,7 +19,7 @@ from calibrate.arviz import base
 from calibrate.measurements import Observation, Observations, missing_values
 from calibrate.posterior import predictions
 from calibrate.posterior.box import BoxEnd, box_ends
-from calibrate.posterior.diagnosis import diagnose, misfits, summary_of
+from calibrate.posterior.diagnosis import diagnose, misfits, nothing_learned, summary_of
 from calibrate.provenance import as_attributes, versions
 from calibrate.samplers import check_options, density_of, find_sampler, named_draws
 from calibrate.samplers.checkpoint import Checkpoint, identity_of
@@ -126,8 +126,15 @@ class Posterior(TableRepr):
         )
         attributes = {str(name): value for name, value in self.tree.attrs.items()}
         faults = [*diagnose(draws, statistics, self.summary(), attributes, self.box_ends())]
+        model = self.model
         if "prior" in self.tree.children:
             faults += predictions.shortfall(self.tree["prior"].sizes["draw"])
+            sds = {
+                model.noise_names[name]: f"sd {noise.upper_sd:g} {model.observe.parts[name].unit}"
+                for name, noise in model.noise.items()
+            }
+            noise = ", ".join(f"{sd} of {name}" for name, sd in sds.items())
+            faults += nothing_learned(self.tree, model.states.unknowns, noise)
         return [*faults, *misfits(self.tree)]
 
     def box_ends(self) -> list[BoxEnd]:

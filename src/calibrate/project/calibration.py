@@ -10,6 +10,7 @@ from calibrate.certificate import Certificate, examine
 from calibrate.certificate.check import can_reweight, reweighted
 from calibrate.measurements import missing_values
 from calibrate.posterior import Posterior, sample
+from calibrate.posterior.diagnosis import MAP_ERRORS, SCALED_NOISE
 from calibrate.project.problem import Problem, build_model, read_problem, simulator_of, with_data
 from calibrate.project.results import (
     CERTIFICATE,
@@ -20,9 +21,12 @@ from calibrate.project.results import (
     save_reweighted,
 )
 from calibrate.project.run import Run
+from calibrate.provenance import as_attributes
 from calibrate.state_names import split
+from calibrate.statistical_model.errors import map_errors
 from emulator.core.errors import InputError
 from emulator.core.store import write_json
+from emulator.surrogates.fem import FEMForward
 
 NOT_CERTIFIED = "not certified"
 DECIDED_BY_FEM = "decided by FEM"
@@ -70,6 +74,11 @@ def infer(
             simulator=problem.simulator if sampler.solves_fem else None,
             checkpoint=None if target is None else target / SAMPLING,
         )
+        attributes: dict[str, Any] = {SCALED_NOISE: problem.scaled_noise}
+        if not (sampler.solves_fem or isinstance(model.full, FEMForward)):
+            errors = map_errors(posterior.model, problem.simulator, posterior.draws())
+            attributes[MAP_ERRORS] = errors
+        posterior.tree.attrs.update(as_attributes(attributes))
         if target is not None:
             save_results(target, problem, posterior)
     return posterior

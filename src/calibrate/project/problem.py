@@ -19,6 +19,7 @@ import numpy as np
 
 from calibrate.measurements import Observations, parse_observation
 from calibrate.measurements.data import read_measurements
+from calibrate.measurements.observation import LARGEST_SHARE
 from calibrate.priors import prior_of
 from calibrate.project.run import Run
 from calibrate.state_names import split
@@ -77,7 +78,21 @@ class Problem:
 
     def change(self, **entries: Any) -> Problem:
         """Return the problem with other entries of its run, of the same scene and data."""
-        return replace(self, run=replace(self.run, **entries).named(self.observe))
+        return replace(self, run=replace(self.run, **entries).named(self.observe, self.scene))
+
+    @property
+    def scaled_noise(self) -> list[str]:
+        """Sentences on the default noises that are smaller than the usual because the body is."""
+        noise, parts = self.run.noise, {split(n)[0]: p for n, p in self.observe.parts.items()}
+        assert isinstance(noise, Mapping)
+        return [
+            f"{name} has the default noise, sd {noise[name]:g} {part.unit}, which is "
+            f"{100 * LARGEST_SHARE:.0f} % of {part.size_in(self.scene):.2g} {part.unit} at rest: "
+            f"give your data's, --noise {name}=SD"
+            for name, part in parts.items()
+            if noise.get(name) != part.usual_sd is not None
+            and noise.get(name) == part.noise_in(self.scene).upper_sd
+        ]
 
 
 def read_problem(run: Run | Problem, where: str = "", *, scene: Scene | None = None) -> Problem:
@@ -116,13 +131,14 @@ def read_problem(run: Run | Problem, where: str = "", *, scene: Scene | None = N
                         "it; say it once"
                     )
             run = replace(run, known={**in_files, **run.known})
+        run = run.named(observe, scene)
         run.noises(observe)
         prior = prior_of(run.prior, scene)
         boxed(load_states(scene, observe.states, prior, run.known)[0], prior, run.bounded)
         for name, description in run.systematic.items():
             words = dict.fromkeys(str(description["of"]).split("+"))
             observe.expand(words, f"systematic '{name}': of")
-        return Problem(run.named(observe), scene, observe, data)
+        return Problem(run, scene, observe, data)
 
 
 @contextmanager
@@ -151,6 +167,14 @@ def with_data(problem: Problem) -> Problem:
         name: np.asarray(exact[name]) + noises[name].simulate(rng, part.shape)
         for name, part in observe.parts.items()
     }
+    for name, part in observe.parts.items():
+        try:
+            part.check(name, data[name])
+        except InputError as error:
+            raise InputError(
+                f"synthetic {error} (without noise {np.min(exact[name]):.3g}): its noise is too "
+                f"large, give a smaller --noise {split(name)[0]}=SD"
+            ) from error
     return replace(problem, data=data)
 
 

@@ -26,6 +26,7 @@ from emulator.surrogates import registry, shipped
 
 if TYPE_CHECKING:
     from calibrate.samplers import Sampler
+    from emulator.scenes.scene import Scene
 
 SYNTHETIC = "synthetic"
 """The word for data that FEM makes."""
@@ -53,7 +54,8 @@ class Run:
     noise : standard deviation by the observation's name, in its unit, or a kind of
         :data:`calibrate.noise.NOISES` with its options, ``{"kind": "student_t", "dof": 4, "scale":
         0.2}``. A bare number belongs to a single observation, or to the displacements. An
-        observation that is not named has its kind's default.
+        observation that is not named has its kind's default, or 3 % of what is observed of the
+        body where that is less.
     noise_scale : scale of the half-normal prior of a standard deviation that is inferred, by the
         same names; synthetic data then still has the standard deviation of ``noise``.
     discrepancy : discrepancy of the model (:mod:`calibrate.noise.discrepancy`) by the
@@ -141,13 +143,16 @@ class Run:
         length = {"warmup": self.warmup, "draws": self.draws, "chains": self.chains}
         return sampler, options_from(sampler, self.sampler_options, **length)
 
-    def named(self, observe: Observations) -> Run:
-        """Return the run with every noise by the observation's name, the defaults filled in."""
+    def named(self, observe: Observations, scene: Scene | None = None) -> Run:
+        """Return the run with every noise by the observation's name, the defaults filled in.
+
+        scene : the scene whose size limits the defaults.
+        """
         scales = _by_name(self.noise_scale, observe, "noise-scale")
         noise = _by_name(self.noise, observe, "noise")
         expanded = observe.expand(noise, "noise")
         defaults = {
-            split(name)[0]: part.default_noise.upper_sd
+            split(name)[0]: (part.noise_in(scene) if scene else part.default_noise).upper_sd
             for name, part in observe.parts.items()
             if name not in expanded
         }

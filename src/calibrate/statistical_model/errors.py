@@ -40,13 +40,16 @@ from calibrate.model_error.systematic import Systematic, marginalised
 from calibrate.noise import information_about_means
 from calibrate.statistical_model.fem_likelihood import FEMLikelihood
 from calibrate.statistical_model.model import Model
+from emulator.accuracy.estimate import newton_distance
 from emulator.accuracy.mesh_error import mesh_error
 from emulator.core.display import counting
 from emulator.core.errors import InputError, SolverError
 from emulator.fem import Simulator
+from emulator.fem.compiled import compiled
 
 FEWEST = 8  # FEM runs from which an error is learned
 _MODES = 12
+_STEPS = 8  # Newton steps that tell the map's error at draws, over all load states
 _WIDTHS = np.geomspace(0.05, 2.0, 12)  # kernel widths in standardised unknowns
 
 
@@ -195,6 +198,31 @@ def with_error(
         )
     fitted = fit(np.array(unknowns), np.array(errors), information, of_mesh=of_mesh)
     return replace(model, error=fitted)
+
+
+def map_errors(
+    model: Model, simulator: Simulator, draws: Mapping[str, np.ndarray]
+) -> dict[str, float]:
+    """Return the map's errors as of :func:`in_noise_sd`, by a Newton step at a few of ``draws``.
+
+    The step is the map's distance from equilibrium to first order; no FEM run is made.
+
+    draws : draws of the posterior, (s,) each by the unknown's name.
+    """
+    if simulator.scene.loaded_by:
+        return {}  # its equations are of two displacements: at rest, and from there to the mesh
+    step = compiled(partial(newton_distance, simulator.system))
+    observe, predict = model.observe, jax.jit(model.full)
+    states, count = len(model.states.states), len(next(iter(draws.values())))
+    errors = []
+    for row in np.linspace(0, count - 1, max(_STEPS // states, 1) + 2)[1:-1].astype(int):
+        thetas = model.states.thetas({name: values[row] for name, values in draws.items()})
+        u = jnp.stack([predict(theta) for theta in thetas])
+        off = jnp.stack([step(each, theta).error for each, theta in zip(u, thetas, strict=True)])
+        by_map, closer = (observe(each[:, observe.nodes], thetas) for each in (u, u - off))
+        error = ravel_pytree(by_map)[0] - ravel_pytree(closer)[0]
+        errors += [error] if bool(jnp.all(jnp.isfinite(error))) else []
+    return in_noise_sd(model, np.array(errors))
 
 
 def in_noise_sd(model: Model, errors: np.ndarray) -> dict[str, float]:

@@ -1,9 +1,12 @@
 """What is wrong with a run, in words."""
 
+import json
+
 import numpy as np
 import pytest
+import xarray as xr
 
-from calibrate.posterior.diagnosis import diagnose
+from calibrate.posterior.diagnosis import MAP_ERRORS, SCALED_NOISE, diagnose, nothing_learned
 
 GOOD = {"mu": {"r_hat": 1.001, "ess_bulk": 900.0, "ess_tail": 800.0}}
 DRAWS = {"mu": np.random.default_rng(0).normal(70.0, 2.0, size=(4, 500))}
@@ -59,3 +62,42 @@ def test_divergences_of_many_parameters_are_placed_by_three():
     summary = dict.fromkeys(draws, GOOD["mu"])
     (sentence,) = diagnose(draws, {"diverging": DRAWS["mu"] < 67.0}, summary, {})
     assert sentence.count("low x") == 3
+
+
+def test_a_wrong_map_comes_first_and_chains_on_it_are_not_blamed_on_the_sampler():
+    errors = {MAP_ERRORS: json.dumps({"reaction:top:x@a": 0.2, "reaction:top:x@b": 3.6})}
+    first, chains, few = said(row={"r_hat": 1.5, "ess_bulk": 7.0}, attributes=errors)
+    assert first.startswith("the forward map misses FEM by 3.6 noise sd in reaction:top:x@b")
+    assert "--forward corrected" in first
+    assert "--error-runs N" in first
+    assert chains == "the chains disagree about mu, R-hat 1.500: mend the map first"
+    assert "more draws" not in few
+    assert said(attributes={MAP_ERRORS: json.dumps({"volume": 0.4})}) == []
+    assert said(attributes={SCALED_NOISE: json.dumps(["volume has"])}) == ["volume has"]
+
+
+def tree(before, after):
+    """A posterior's tree with two unknowns; ``before`` and ``after`` are (2, s)."""
+    groups = {
+        group: xr.Dataset(
+            {n: (("chain", "draw"), row[None]) for n, row in zip("ab", rows, strict=True)}
+        )
+        for group, rows in (("prior", before), ("posterior", after))
+    }
+    return xr.DataTree.from_dict(groups)
+
+
+def test_a_posterior_that_is_the_prior_is_said_to_be_that():
+    rng = np.random.default_rng(0)
+    before, after = rng.uniform(size=(2, 500)), rng.uniform(size=(2, 900))
+    (line,) = nothing_learned(tree(before, after), ("a", "b"), "sd 1 mL of volume")
+    assert line.startswith("the data say next to nothing: what is known best keeps ")
+    assert "sd 1 mL of volume: give your data's if it is smaller (--noise)" in line
+    # Known are: their sum only, one of them, that the ends are right and the middle is not.
+    for known in (
+        after[:, np.abs(after.sum(axis=0) - 1.0) < 0.2],
+        after[:, after[1] < 0.4],
+        after[:, np.abs(after[0] - 0.5) > 0.35],
+    ):
+        assert nothing_learned(tree(before, known), ("a", "b"), "") == []
+    assert nothing_learned(tree(before[:, :9], after), ("a", "b"), "") == []

@@ -1,7 +1,7 @@
 """Noise of a run: from words and JSON to the likelihood and to synthetic data."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, astuple, replace
 
 import numpy as np
 import pytest
@@ -13,9 +13,12 @@ from calibrate.cli.run_words import discrepancy_words, noise_scale_words, noise_
 from calibrate.measurements import parse_observation
 from calibrate.measurements.data import write_data
 from calibrate.noise import DiscrepancyNoise, StudentTNoise
-from calibrate.project import Run, infer, make_data, read_posterior, report
+from calibrate.project import Run, infer, make_data, read_posterior, read_problem, report
 from emulator.core import schema
 from emulator.core.errors import InputError
+from emulator.geometry.generators.ellipsoid import HUMAN
+from emulator.scenes.built_in import BUILT_IN
+from emulator.scenes.scene import cavity_sets
 from linear_support import linear_forward
 
 TRUTH = {"mu": 70.0, "lam": 60.0}
@@ -129,3 +132,39 @@ def test_what_is_said_of_one_state_makes_its_noise_one_of_its_own(beam):
         "displacement": 0.3,
     }
     assert all(isinstance(noise, DiscrepancyNoise) for noise in found.values())
+
+
+def test_a_default_is_no_larger_than_the_body_allows_and_said_to_be_that():
+    mouse = em.scenes.left_ventricle(
+        rings=3, around=8, layers=1, order=1, wall=tuple(0.1 * x for x in astuple(HUMAN))
+    )
+    truth = dict(zip(mouse.parameter_names, mouse.centre.tolist(), strict=True))
+    run = Run("left_ventricle", observe="volume+nodes:5+length:3:14+strain:fibre:2", truth=truth)
+    problem = read_problem(run, scene=mouse)
+    volume = problem.observe.parts["volume"].cavity.rest
+    assert problem.run.noise["volume"] == pytest.approx(0.03 * volume, rel=0.02)
+    assert problem.run.noise["length:3:14"] == pytest.approx(0.03 * mouse.mesh.size, rel=0.02)
+    assert (problem.run.noise["displacement"], problem.run.noise["strain"]) == (0.2, 0.02)
+    first, second = problem.scaled_noise
+    assert f"volume has the default noise, sd {problem.run.noise['volume']:g} mL" in first
+    assert "--noise length:3:14=SD" in second
+    given = read_problem(replace(run, noise={"volume": 1.0, "length:3:14": 0.5}), scene=mouse)
+    assert given.scaled_noise == []
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_built_in_bodies_are_large_enough_for_the_usual_noise(name):
+    scene = BUILT_IN[name]()
+    words = ["nodes:3", "length:3:14", *(f"volume:{wall}" for wall in cavity_sets(scene))]
+    problem = read_problem(Run(name, observe="+".join(words)), scene=scene)
+    assert set(problem.run.noise.values()) <= {0.2, 0.5, 1.0}
+    assert problem.scaled_noise == []
+
+
+def test_data_that_its_own_noise_makes_impossible_blames_the_noise(ventricle):
+    truth = dict(zip(ventricle.parameter_names, ventricle.centre.tolist(), strict=True))
+    run = Run("left_ventricle", observe="volume", truth=truth, noise=5000.0, seed=4)
+    with pytest.raises(InputError, match=r"synthetic data: volume is -.* mL; it must be above 0 "):
+        make_data(run, ventricle)
+    with pytest.raises(InputError, match="its noise is too large, give a smaller --noise volume="):
+        make_data(run, ventricle)

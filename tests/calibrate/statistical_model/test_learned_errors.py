@@ -11,11 +11,13 @@ from numpyro.infer.util import log_density
 from scipy.stats import multivariate_normal
 
 import calibrate as cal
+import emulator as em
 from calibrate.model_error import ModelError
 from calibrate.posterior import sample
 from calibrate.statistical_model import with_error
-from calibrate.statistical_model.errors import fit
+from calibrate.statistical_model.errors import fit, map_errors
 from emulator.core.errors import InputError
+from emulator.surrogates.taylor import expand
 from linear_support import LinearSimulator, closed_form, linear_forward
 
 NODES = np.array([3, 11, 20, 30])
@@ -192,3 +194,17 @@ def test_what_is_refused(truth, poor, cube):
     )
     with pytest.raises(InputError, match="answered at 0 of 10 draws of the prior; 8 are needed"):
         with_error(nowhere, LinearSimulator(truth), 10)
+
+
+def test_a_newton_step_tells_what_the_map_misses(beam, simulator, aware):
+    forward = em.Emulator(beam, taylor=expand(simulator, order=1)).cache()
+    model = cal.model(forward, cal.nodal_displacements(beam, NODES), cal.GaussianNoise(sd=NOISE))
+    theta = beam.theta(mu=95.0, lam=55.0)
+    draws = {
+        name: np.full(20, float(value)) for name, value in zip(model.names, theta, strict=True)
+    }
+    off = np.asarray(forward(theta) - simulator(theta))[NODES]
+    told = map_errors(model, simulator, draws)
+    assert told == {"displacement": pytest.approx(np.sqrt(np.mean(off**2)) / NOISE, rel=0.1)}
+    assert told["displacement"] > 1.0
+    assert map_errors(replace(model, error=aware.error), simulator, draws) == {}

@@ -84,7 +84,7 @@ def _after(arguments: Namespace) -> Answer:
     candidates = {}
     for word in "+".join(arguments.next).split("+") if arguments.next else ():
         (part,) = parse_observation(scene, word, run.seed).parts.values()
-        candidates[word] = (part, part.default_noise)
+        candidates[word] = (part, part.noise_in(scene))
     if candidates:
         gains = next_measurement(posterior, candidates)
         rows = [
