@@ -1,13 +1,12 @@
 """Meshes in and out of files with their named sets, deformed bodies out to VTU, through meshio.
 
 scikit-fem's, PyVista's and meshio's own meshes are recognised by their attributes; none of these
-libraries is imported for it. Gmsh, Abaqus and others store names of groups differently: meshio
-returns them as ``field_data`` with tags, ``cell_sets`` or ``point_sets``. In formats without named
-sets (VTU, XDMF) a set is an array of 0 and 1 called ``set:<name>``, on triangles or on points.
+libraries is imported for it.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,13 +15,14 @@ from typing import Any
 
 import meshio
 import numpy as np
-from meshio import _helpers
 
 from emulator.core.errors import InputError
 from emulator.core.store import replacing
 from emulator.geometry.discretisation import quadrature_points
 from emulator.geometry.fibres import across, from_elements, from_nodes
-from emulator.geometry.mesh import Mesh, boundary_facets, coincident, find_rows, orient
+from emulator.geometry.file_formats import read_cells
+from emulator.geometry.groups import MARK, TAG, Sets, read_sets, tag_array, unused
+from emulator.geometry.mesh import Mesh, coincident, find_rows, orient
 from emulator.geometry.refinement import to_quadratic
 
 # meshio's cells by the elements' order: (tetrahedron, triangle).
@@ -30,16 +30,16 @@ _CELLS = {1: ("tetra", "triangle"), 2: ("tetra10", "triangle6")}
 _LOWER = {"triangle", "triangle6", "line", "line3", "vertex"}
 # VTK's numbers of cell types, and meshio's names.
 _VTK = {1: "vertex", 3: "line", 5: "triangle", 10: "tetra", 22: "triangle6", 24: "tetra10"}
-_PLURAL = {0: "points", 1: "lines", 2: "triangles"}
-_MARK = "set:"
-_TAG = "gmsh:physical"
+# Names of directions, in any case.
+_NAMES = {
+    "fibres": r"(fib(er|re)?s?([ _-]?(dir|vec|orient|ax[ei]s|field)\w*)?|f[ _]?0)",
+    "sheets": r"(sheets?([ _-]?(dir|vec|orient|ax[ei]s|field)\w*)?|s[ _]?0)",
+}
 # A direction whose length differs from 1 by more is refused; single precision stays far below.
 _UNIT = 1e-3
 # Fibres and sheets that were interpolated are made orthogonal again, if the cosine between them is
 # below this at nine points in ten: at a jump, as between two walls, it may be anything.
 _SKEW = 0.2
-
-Sets = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,12 +47,13 @@ class Body:
     """A mesh with fibres and sheets at its elements' quadrature points.
 
     Both are (m, 3) on a linear mesh and (m, q, 3) on a quadratic one; ``None`` where the file has
-    none.
+    none. ``unused`` has a phrase for each group and each array of the file that is in none of them.
     """
 
     mesh: Mesh
     fibres: np.ndarray | None = None
     sheets: np.ndarray | None = None
+    unused: tuple[str, ...] = ()
 
 
 def read_mesh(source: str | Path | Any) -> Mesh:
@@ -77,9 +78,10 @@ def read_mesh(source: str | Path | Any) -> Mesh:
 def read_body(source: str | Path | Any, *, quadratic: bool = False) -> Body:
     """Return the mesh as :func:`read_mesh` returns it, with its ``fibres`` and ``sheets``.
 
-    Both are data of points, or of cells: (m, 3), or (m, 3 q) for all quadrature points. Point and
-    cell data are interpolated at the quadrature points (:mod:`emulator.geometry.fibres`); cell
-    data of linear elements is taken as it is.
+    Both are data of points, or of cells: (m, 3), or (m, 3 q) for all quadrature points, also under
+    other programs' names such as ``fiber``, ``FIB_DIR`` and ``f0``. Point and cell data are
+    interpolated at the quadrature points (:mod:`emulator.geometry.fibres`); cell data of linear
+    elements is taken as it is.
 
     Parameters
     ----------
@@ -91,16 +93,31 @@ def read_body(source: str | Path | Any, *, quadratic: bool = False) -> Body:
         As :func:`read_mesh`, or a direction that is not a unit vector.
     """
     with _content(source) as content:
-        mesh, numbers = _mesh(content)
+        mesh, numbers, left = _mesh(content)
         order = 2 if quadratic else mesh.order
-        fibres, sheets = (
-            _directions(content, mesh, numbers, name, order) for name in ("fibres", "sheets")
-        )
+        found: dict[str, np.ndarray | None] = dict.fromkeys(_NAMES)
+        used = [tag_array(content)]
+        for kind, pattern in _NAMES.items():
+            names = (kind, *content.cell_data, *content.point_data)
+            for name in (each for each in names if re.fullmatch(pattern, each, re.IGNORECASE)):
+                try:
+                    found[kind] = _directions(content, mesh, numbers, name, order)
+                except InputError as error:
+                    if name == kind:
+                        raise
+                    left.append(str(error))
+                    used.append(name)
+                if found[kind] is not None:
+                    used.append(name)
+                    break
+        fibres, sheets = found.values()
         if fibres is not None and sheets is not None and fibres.ndim == 3:
             # Interpolation does not preserve orthogonality.
             skew = np.quantile(np.abs(np.sum(fibres * sheets, axis=-1)), 0.9)
             sheets = across(sheets, fibres) if skew < _SKEW else sheets
-        return Body(mesh if order == mesh.order else to_quadratic(mesh), fibres, sheets)
+        left += unused(content, _CELLS[mesh.order][0], used)
+        mesh = mesh if order == mesh.order else to_quadratic(mesh)
+        return Body(mesh, fibres, sheets, tuple(left))
 
 
 def read_regions(path: str | Path, name: str) -> np.ndarray:
@@ -188,30 +205,6 @@ def write_vtu(path: str | Path, mesh: Mesh, **data: Any) -> None:
         meshio.write(temporary, output, file_format="vtu")
 
 
-def read_cells(path: Path) -> meshio.Mesh:
-    """Return the content of a file as meshio reads it; :class:`InputError` where it cannot."""
-    if not path.is_file():
-        what = "is a folder; name a file in it" if path.is_dir() else "does not exist"
-        raise InputError(f"mesh file {path} {what}")
-    if not path.stat().st_size:
-        raise InputError(f"mesh file {path} is empty")
-    reasons = []
-    try:
-        # meshio.read prints why its readers refuse a file, and exits; standard output could only
-        # be caught for all threads. Readers raise exceptions of many types.
-        # In a text file of STL one takes letters for a number of triangles, which overflows.
-        for kind in _helpers._filetypes_from_path(path):
-            try:
-                with np.errstate(over="ignore"):
-                    return _helpers.reader_map[kind](str(path))
-            except meshio.ReadError as error:
-                reasons.append(f"not valid {kind}: {error}".removesuffix(": "))
-    except Exception as error:
-        reasons = [str(error) or type(error).__name__]
-    reason = " ".join("; ".join(reasons).split())[:160]
-    raise InputError(f"mesh file {path} cannot be read as a mesh: {reason}")
-
-
 @contextmanager
 def _content(source: str | Path | Any) -> Iterator[meshio.Mesh]:
     """Yield a file or a mesh of another library as meshio has it; errors then name the source."""
@@ -271,18 +264,19 @@ def _from_pyvista(source: Any) -> meshio.Mesh:
     )
 
 
-def _mesh(content: meshio.Mesh) -> tuple[Mesh, np.ndarray]:
-    """Return the mesh, and the file's number (n,) of each of its nodes."""
+def _mesh(content: meshio.Mesh) -> tuple[Mesh, np.ndarray, list[str]]:
+    """Return the mesh, the file's number (n,) of each of its nodes, and groups left out."""
     kind = _tetrahedra(content)
     elements = content.get_cells_type(kind)
     numbers, points = np.unique(elements), np.asarray(content.points, dtype=float)
     if numbers[0] < 0 or numbers[-1] >= len(points):
-        return Mesh(points, elements), numbers  # raises InputError and names the range
+        return Mesh(points, elements), numbers, []  # raises InputError and names the range
     number = np.full(len(points), -1)
     number[numbers] = np.arange(len(numbers))
     nodes = points[numbers]
     elements = orient(nodes, number[elements])
-    mesh = Mesh(nodes, elements, *_sets(content, number, elements))
+    node_sets, facet_sets, left = read_sets(content, number, elements)
+    mesh = Mesh(nodes, elements, node_sets, facet_sets)
     pairs = coincident(nodes)
     if len(pairs):
         one, other = np.sort(numbers[pairs[0]])
@@ -290,7 +284,7 @@ def _mesh(content: meshio.Mesh) -> tuple[Mesh, np.ndarray]:
             f"its nodes {one} and {other} are at the same place, {len(pairs)} such pairs, so that "
             "what touches there is not joined; merge them"
         )
-    return mesh, numbers
+    return mesh, numbers, left
 
 
 def _tetrahedra(content: meshio.Mesh) -> str:
@@ -346,64 +340,6 @@ def _check_lengths(values: np.ndarray, name: str, where: str) -> np.ndarray:
     return values / length
 
 
-def _sets(content: meshio.Mesh, number: np.ndarray, elements: np.ndarray) -> tuple[Sets, Sets]:
-    """Return the node sets and facet sets of a file's groups; groups of volumes are left out.
-
-    number : the new number (n,) of each of the file's nodes, -1 for dropped nodes.
-    elements : (m, 4 or 10) tetrahedra in the new numbers, positively oriented.
-    """
-    triangles: dict[str, list[np.ndarray]] = {}
-    points: dict[str, list[np.ndarray]] = {}
-    for name, corners in _groups(content):
-        if corners.size:
-            of_kind = triangles if corners.shape[1] == 3 else points
-            of_kind.setdefault(name, []).append(number[corners])
-    surface = boundary_facets(elements) if triangles else np.empty((0, 3), int)
-    facet_sets = {}
-    for name, groups in triangles.items():
-        rows = np.unique(np.sort(np.concatenate(groups), axis=1), axis=0)
-        places = find_rows(rows, surface[:, :3])
-        if inside := int((places < 0).sum()):
-            raise InputError(
-                f"{inside} of the {len(rows)} triangles in group '{name}' are not on the "
-                "surface of the tetrahedra; a group of triangles must lie on it"
-            )
-        facet_sets[name] = surface[places]
-    node_sets = {name: np.unique(rows) for name, rows in facet_sets.items()}
-    for name, groups in points.items():
-        nodes = np.unique(np.concatenate(groups, axis=None))
-        node_sets[name] = nodes[nodes >= 0]
-    return {name: nodes for name, nodes in node_sets.items() if nodes.size}, facet_sets
-
-
-def _groups(content: meshio.Mesh) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the name and the corners (k, 1, 2 or 3) of every group of points, lines, triangles."""
-    names = {tuple(map(int, entry)): name for name, entry in content.field_data.items()}
-    for k, block in enumerate(content.cells):
-        if block.dim == 3:
-            continue
-        corners = np.asarray(block.data)[:, : block.dim + 1]
-        for name, members in content.cell_sets.items():
-            if name != "gmsh:bounding_entities" and members[k] is not None:
-                yield name, corners[np.asarray(members[k], dtype=np.int64)]
-        for name, data in content.cell_data.items():
-            if name.startswith(_MARK):
-                yield name.removeprefix(_MARK), corners[np.flatnonzero(data[k])]
-        tags = np.asarray(content.cell_data[_TAG][k] if _TAG in content.cell_data else [])
-        for tag in np.unique(tags[tags != 0]).tolist():
-            if (tag, block.dim) not in names:
-                raise InputError(
-                    f"physical group {tag} ({_PLURAL[block.dim]}) has no name of its own; "
-                    "name it in the mesh generator ($PhysicalNames)"
-                )
-            yield names[tag, block.dim], corners[tags == tag]
-    for name, nodes in content.point_sets.items():
-        yield name, np.asarray(nodes, dtype=np.int64)[:, None]
-    for name, data in content.point_data.items():
-        if name.startswith(_MARK):
-            yield name.removeprefix(_MARK), np.flatnonzero(data)[:, None]
-
-
 def _own_node_sets(mesh: Mesh) -> Sets:
     """Return the node sets that do not follow from the facet set of the same name."""
     return {
@@ -421,7 +357,7 @@ def _with_tags(mesh: Mesh, own: Sets) -> meshio.Mesh:
     blocks = [(solid, mesh.elements), *((kind, rows) for _, kind, _, rows in groups)]
     tags = [np.full(len(rows), tag) for tag, (_, rows) in enumerate(blocks)]
     names = {name: np.array([k, dim]) for k, (dim, _, name, _) in enumerate(groups, start=1)}
-    data = {_TAG: tags, "gmsh:geometrical": [tag + 1 for tag in tags]}
+    data = {TAG: tags, "gmsh:geometrical": [tag + 1 for tag in tags]}
     return meshio.Mesh(mesh.nodes, blocks, cell_data=data, field_data=names)
 
 
@@ -441,6 +377,6 @@ def _with_marks(mesh: Mesh, own: Sets, directions: Sets) -> meshio.Mesh:
             values.append(np.zeros((len(rows), values[0].shape[1])))
         none = np.zeros(len(mesh.elements), np.int32)
         for name, facets in mesh.facet_sets.items():
-            data[_MARK + name] = [none, mark(find_rows(facets, rows), len(rows))]
-    points = {_MARK + name: mark(nodes, len(mesh.nodes)) for name, nodes in own.items()}
+            data[MARK + name] = [none, mark(find_rows(facets, rows), len(rows))]
+    points = {MARK + name: mark(nodes, len(mesh.nodes)) for name, nodes in own.items()}
     return meshio.Mesh(mesh.nodes, blocks, cell_data=data, point_data=points)

@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 
 from emulator.core.errors import InputError
 from emulator.geometry.facets import enclosed_volume, openings
-from emulator.geometry.io import read_cells
+from emulator.geometry.file_formats import read_cells
 from emulator.geometry.mesh import SIDES, parts
 
 UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0}

@@ -1,13 +1,16 @@
 """A first scene file for a mesh, with comments on its guesses.
 
-Sets are recognised by their names (base, fixed, endocardium, ...), the unit of length by the size
-of the body. The draft is a scene that can be simulated. Entries that nothing in the mesh suggests,
-such as the ranges of parameters, are marked CHANGE.
+Sets are recognised by their names (base, fixed, endocardium, LV, ...), the unit of length by the
+size of the body. Where no set is a support, the largest flat face at an end of the body is held,
+or the end itself. The draft is a scene that can be simulated. Entries that nothing in the mesh
+suggests, such as the ranges of parameters, are marked CHANGE.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -18,19 +21,29 @@ from emulator.core.errors import InputError, look_up
 from emulator.geometry.discretisation import mesh_quality
 from emulator.geometry.facets import mean_normal
 from emulator.geometry.io import Body, read_body, write_mesh
-from emulator.geometry.mesh import EDGES, Mesh
+from emulator.geometry.mesh import EDGES, Mesh, cross_sides
 from emulator.geometry.surfaces import UNITS
 from emulator.mechanics.laws import find_law
 from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.file import read_scene
 from emulator.scenes.loads import CavityPressure, FollowerPressure, Gravity, Load
 from emulator.scenes.scene import Scene
+from emulator.scenes.supports.dirichlet import Support, loose_parts
 
 _METRES = 0.6  # a body smaller than this in all directions is taken to be in m
 _SMALL = 25.0  # a body smaller than this might be in cm
-_SUPPORTS = ("base", "fix", "clamp", "held", "hold", "support", "ligament", "left", "bottom")
-_INSIDE = ("endo", "cavity", "lumen", "inner", "inside")
-_OUTSIDE = ("epi", "outer", "outside", "pericard")
+# What names of sets contain, the likeliest first, in words of small letters.
+_NO_WALL = r"^(?!.*(endo|epi|cavity|lumen|inner|inside|outer|outside)).*"
+_SUPPORTS = (
+    f"{_NO_WALL}base",
+    *("fix", "clamp", "held", "hold", "support", "ligament"),
+    rf"{_NO_WALL}\bleft\b(?! (ventric|atri))",
+    f"{_NO_WALL}bottom",
+)
+_INSIDE = ("endo", "cavity", "lumen", "inner", "inside", r"\blv\b", "left ventric", r"\brv\b")
+_OUTSIDE = ("epi", "outer", "outside", "pericard", r"\bwall\b")
+_LEAST_FACE = 0.005  # of the surface; a flat face this large holds the body
+_LEAST_END = 0.15  # likewise of an end that is not flat
 # Ranges of known parameters: the paper's, textbook form.
 _RANGES = {
     "a": (0.2, 0.52),
@@ -44,6 +57,7 @@ _RANGES = {
 }
 _CONSTANTS = {"kappa": 25.0}
 _MODULUS, _NUMBER = (1.0, 10.0), (1.0, 5.0)
+_WEIGHT, _MOST_STRESS = 1.04e-2, 5.0  # kPa/mm; kPa, which the ranges stand
 _MOST_QUADRATIC = 20_000  # nodes that are simulated in seconds
 _LINEAR = (
     "the mesh has linear tetrahedra, which lock: a ventricle of them fills by a quarter too little"
@@ -114,14 +128,16 @@ def draft_scene(
     material, support = find_law(law), _support(mesh, notes)
     head = [
         f'law = "{material.name}"   # see docs/extending.md for others',
-        f'mesh = "{mesh_name}"',
+        f"mesh = {_quoted(mesh_name)}",
         *_elements(mesh),
     ]
+    if body.unused:
+        notes.append(f"in the mesh file and not used: {', '.join(body.unused)}")
     sections = ["\n".join(head)]
     if material.fibres and body.fibres is None:
         sections.append(_fibres(mesh, walls))
-    for load, lines, note in _loads(mesh):
-        quantities = _quantities([*material.quantities, *load.quantities])
+    for load, lines, note, stiffer in _loads(mesh):
+        quantities = _quantities([*material.quantities, *load.quantities], stiffer)
         entries = "\n\n".join([*sections, support, lines, *quantities]) + "\n"
         all_notes = (*notes, note, *_unused(mesh, entries))
         out.write_text(_header(mesh, all_notes) + entries, encoding="utf-8")
@@ -129,9 +145,11 @@ def draft_scene(
             return Draft(out, read_scene(out), all_notes)
         except InputError as error:
             out.unlink()
-            failure = error
+            failure = str(error).replace(str(out), "its scene")
         notes.append(f"not the load '{load.kind}': {failure}")
-    raise failure
+    if mesh_name == f"{mesh_path.stem}_mm.vtu" and unit != "mm":
+        out.with_name(mesh_name).unlink()
+    raise InputError(f"mesh file {mesh_path}: {failure}")
 
 
 def _in_mm(body: Body, path: Path, out: Path, unit: str, notes: list[str]) -> tuple[Body, str]:
@@ -149,14 +167,32 @@ def _in_mm(body: Body, path: Path, out: Path, unit: str, notes: list[str]) -> tu
     return replace(body, mesh=mesh), target.name
 
 
-def _find_set(sets: Mapping[str, np.ndarray], words: tuple[str, ...]) -> str | None:
-    """Return the first set whose name contains one of ``words``, the likeliest word first."""
-    return next((name for word in words for name in sets if word in name.lower()), None)
+def _quoted(name: str) -> str:
+    """Return a name as a string of TOML."""
+    return json.dumps(name, ensure_ascii=False)
+
+
+def _find_set(sets: Iterable[str], words: tuple[str, ...]) -> str | None:
+    """Return the set whose name contains the likeliest of ``words``, of the left heart if any."""
+    names = {}
+    for name in sets:
+        parted = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)
+        names[name] = " ".join(re.findall("[a-z]+", parted.lower()))
+    for word in words:
+        found = [name for name, label in names.items() if re.search(word, label)]
+        if found:
+            return min(found, key=lambda name: bool(re.search(r"\b(rv|right)\b", names[name])))
+    return None
+
+
+def _find_wall(mesh: Mesh, words: tuple[str, ...]) -> str | None:
+    """Return the facet set whose name contains one of ``words`` and that is no support."""
+    return _find_set((n for n in mesh.facet_sets if not _find_set([n], _SUPPORTS)), words)
 
 
 def _walls(mesh: Mesh) -> tuple[str, str] | None:
     """Return the facet sets between which fibres can be computed, or None."""
-    inner, outer = (_find_set(mesh.facet_sets, words) for words in (_INSIDE, _OUTSIDE))
+    inner, outer = (_find_wall(mesh, words) for words in (_INSIDE, _OUTSIDE))
     return (inner, outer) if inner and outer else None
 
 
@@ -164,7 +200,7 @@ def _fibres(mesh: Mesh, walls: tuple[str, str] | None) -> str:
     """Return the lines of the fibre rule."""
     if walls is None:
         return '[fibres]   # CHANGE\nrule = "uniform"\ndirection = [1.0, 0.0, 0.0]'
-    base = _find_set(mesh.facet_sets, ("base",))
+    base = _find_set(mesh.facet_sets, _SUPPORTS[:1])
     axis = "axis = [0.0, 0.0, 1.0]   # CHANGE: from apex to base"
     if base is not None:
         # Rounded, so that a base that is level to round-off gives a level axis, without -0.
@@ -173,8 +209,8 @@ def _fibres(mesh: Mesh, walls: tuple[str, str] | None) -> str:
     return f"""[fibres]
 rule = "helix"
 angles = [60.0, -60.0]   # degrees, inside and outside
-endocardium = "{walls[0]}"
-epicardium = "{walls[1]}"
+endocardium = {_quoted(walls[0])}
+epicardium = {_quoted(walls[1])}
 {axis}"""
 
 
@@ -193,48 +229,89 @@ def _elements(mesh: Mesh) -> list[str]:
 
 
 def _support(mesh: Mesh, notes: list[str]) -> str:
-    """Return the lines of the support."""
+    """Return the lines of the supports, under which no part of the body can move or turn."""
     name = _find_set(mesh.node_sets, _SUPPORTS)
+    sets = ", ".join(mesh.node_sets) or "none"
+    why, sections = f"no set is named like a support ({sets})", []
     if name is not None:
         notes.append(f"held at '{name}'")
-        return f'[[supports]]\nnode_set = "{name}"   # all components; see components = "z"'
-    axis = int(np.argmax(np.ptp(mesh.nodes, axis=0)))
-    letter, at = "xyz"[axis], float(mesh.nodes[:, axis].min())
-    sets = ", ".join(mesh.node_sets) or "none"
-    notes.append(
-        f"no set is named like a support ({sets}): held where {letter} is least, {at:.6g} mm; "
-        "change it"
-    )
-    return f"""[node_sets.held]   # CHANGE: no set is named like a support
-axis = "{letter}"
-at = {at!r}
+        why = f"'{name}' alone leaves the body free to turn or move"
+        components = '   # all components; see components = "z"'
+        sections.append(f"[[supports]]\nnode_set = {_quoted(name)}{components}")
+    loose = loose_parts(mesh, [Support(name)] if name else [])
+    for k, (nodes, _) in enumerate(loose, start=1):
+        letter, at, where = _end(mesh, nodes)
+        if f'axis = "{letter}"\nat = {at}\n' in "".join(sections):
+            continue  # held with another part
+        own = f"held_{k}" if k > 1 else "held"
+        while own in mesh.node_sets:
+            own += "_"
+        notes.append(f"{why}: held where {letter} is {where} mm; change it")
+        sections.append(
+            f"[node_sets.{own}]   # CHANGE: {why.split(' (')[0]}\n"
+            f'axis = "{letter}"\nat = {at}\n\n[[supports]]\nnode_set = "{own}"'
+        )
+        why = "another part of the mesh"
+    return "\n\n".join(sections)
 
-[[supports]]
-node_set = "held\""""
+
+def _end(mesh: Mesh, nodes: np.ndarray) -> tuple[str, float | list[float], str]:
+    """Return where to hold the part of these nodes: axis, one or two coordinates mm, and words.
+
+    On the flat face where its longest axis is least; or on its largest flat face across an axis; or
+    between two planes that cut off its end.
+    """
+    corners = mesh.nodes[mesh.surface[np.isin(mesh.surface[:, 0], nodes)][:, :3]]
+    area = np.linalg.norm(cross_sides(corners), axis=1)
+    low, high = mesh.nodes[nodes].min(axis=0), mesh.nodes[nodes].max(axis=0)
+    longest = int(np.argmax(high - low))
+    ends = [(axis, at) for axis in (longest, 0, 1, 2) for at in (low, high)]
+    flat = [
+        area[(np.abs(corners[..., axis] - at[axis]) <= 1e-8 * mesh.size).all(axis=1)].sum()
+        for axis, at in ends
+    ]
+    best = 0 if flat[0] > _LEAST_FACE * area.sum() else int(np.argmax(flat))
+    axis, at = ends[best]
+    if flat[best] > _LEAST_FACE * area.sum():
+        place = float(at[axis])
+        return "xyz"[axis], place, f"{'least' if at is low else 'greatest'}, {place:.6g}"
+    heights = corners[..., longest].max(axis=1)
+    order = np.argsort(heights)
+    last = np.searchsorted(np.cumsum(area[order]), _LEAST_END * area.sum())
+    between = [float(low[longest]), float(heights[order][last])]
+    return "xyz"[longest], between, f"between {between[0]:.6g} and {between[1]:.6g}"
 
 
-def _loads(mesh: Mesh) -> list[tuple[Load, str, str]]:
-    """Return the loads to try, each with its lines and a note."""
-    loads: list[tuple[Load, str, str]] = []
-    wall = _find_set(mesh.facet_sets, _INSIDE)
+def _loads(mesh: Mesh) -> list[tuple[Load, str, str, float]]:
+    """Return the loads to try, each with its lines, a note, and by how much moduli are raised.
+
+    Under its own weight, they are raised so that a beam of the body's size stands it.
+    """
+    loads: list[tuple[Load, str, str, float]] = []
+    wall = _find_wall(mesh, _INSIDE)
     if wall is not None:
         for kind in (CavityPressure, FollowerPressure):
-            lines = f'[[loads]]\nkind = "{kind.kind}"\nfacet_set = "{wall}"\n'
+            lines = f'[[loads]]\nkind = "{kind.kind}"\nfacet_set = {_quoted(wall)}\n'
             lines += "# pressure = 0.8   # kPa; without it, a parameter"
-            loads.append((kind(wall), lines, f"pressure on '{wall}'"))
+            loads.append((kind(wall), lines, f"pressure on '{wall}'", 1.0))
     gravity = f'[[loads]]   # CHANGE\nkind = "{Gravity.kind}"\ndensity = 1.06   # g/cm3\n'
     note = "its own weight along -z is the load; change it if you know another"
-    return [*loads, (Gravity(), gravity + "direction = [0.0, 0.0, -1.0]", note)]
+    extent = np.ptp(mesh.nodes, axis=0)
+    stress = 3.0 * _WEIGHT * extent.max() ** 2 / extent.min()
+    stiffer = max(1.0, float(f"{stress / _MOST_STRESS:.1g}"))
+    return [*loads, (Gravity(), gravity + "direction = [0.0, 0.0, -1.0]", note, stiffer)]
 
 
-def _quantities(quantities: Sequence[Quantity]) -> list[str]:
+def _quantities(quantities: Sequence[Quantity], stiffer: float) -> list[str]:
     """Return a table for each parameter, and that of the constants."""
     sections, constants = [], []
     for quantity in quantities:
         if quantity.name in _CONSTANTS:
-            constants.append(f"{quantity.name} = {_CONSTANTS[quantity.name]}")
+            constants.append(f"{quantity.name} = {_CONSTANTS[quantity.name] * stiffer}")
             continue
         low, high = _RANGES.get(quantity.name, _MODULUS if quantity.unit else _NUMBER)
+        if quantity.unit == "kPa":
+            low, high = low * stiffer, high * stiffer
         if not quantity.low < low < high < quantity.high:
             span = quantity.high - quantity.low
             low, high = quantity.low + 0.25 * span, quantity.low + 0.75 * span
@@ -247,14 +324,16 @@ def _quantities(quantities: Sequence[Quantity]) -> list[str]:
 
 
 def _unused(mesh: Mesh, text: str) -> list[str]:
-    """Return a note on facet sets that the scene file does not use, and a load for them."""
-    names = [name for name in mesh.facet_sets if f'"{name}"' not in text]
+    """Return a note on sets that the scene file does not use, and a load for them."""
+    names = [name for name in mesh.node_sets if _quoted(name) not in text]
+    facets = [name for name in names if name in mesh.facet_sets]
     if not names:
         return []
-    return [
-        f'not used: {", ".join(names)}; a force on one: [[loads]] with kind = "traction", '
-        f'facet_set = "{names[0]}", traction = [0.0, 0.0, 1.0] in kPa'
-    ]
+    entries = 'kind = "force", node_set = {}, resultant = [0.0, 0.0, 1.0] in N'
+    if facets:
+        entries = 'kind = "traction", facet_set = {}, traction = [0.0, 0.0, 1.0] in kPa'
+    entries = entries.format(_quoted((facets or names)[0]))
+    return [f"not used: {', '.join(names)}; a force on one: [[loads]] with {entries}"]
 
 
 def _header(mesh: Mesh, notes: Sequence[str]) -> str:

@@ -110,12 +110,12 @@ def _several_bodies(
                 regions[entry.name] = read_regions(folder / entry.mesh, file.regions)
     with source.at("bodies"):
         bodies = side_by_side({name: body.mesh for name, body in members.items()})
-        stacked = []
+        stacked: list[np.ndarray | None] = []
         for kind in ("fibres", "sheets"):
             values = {name: getattr(body, kind) for name, body in members.items()}
             some_lack = any(v is None for v in values.values())
             stacked.append(None if some_lack else bodies.stacked(values))
-    return Body(bodies.mesh, *stacked), bodies.stacked(regions) if regions else None
+    return Body(bodies.mesh, stacked[0], stacked[1]), bodies.stacked(regions) if regions else None
 
 
 def _read_body(path: Path, file: SceneFile, law: Law, source: Source, *entry: str | int) -> Body:
@@ -160,12 +160,14 @@ def _with_planes(mesh: Mesh, file: SceneFile, source: Source) -> Mesh:
 def _on_plane(
     mesh: Mesh, node_sets: Mapping[str, np.ndarray], plane: Plane, member: str, rows: np.ndarray
 ) -> np.ndarray:
-    """Return whether all nodes of ``rows`` (k, a) lie on the plane, (k,); refuse a plane of none.
+    """Return whether all nodes of ``rows`` (k, a) lie on the plane, (k,); refuse one of none.
 
     member : what a row is, "node" or "surface triangle".
     """
     coordinate = mesh.nodes[:, "xyz".index(plane.axis)]
-    on_plane = np.abs(coordinate - plane.at) <= _ON_PLANE * mesh.size
+    first, last = plane.at if isinstance(plane.at, tuple) else (plane.at, plane.at)
+    off = np.maximum(first - coordinate, coordinate - last)
+    on_plane = off <= _ON_PLANE * mesh.size
     if plane.within is not None:
         parent = look_up(node_sets, plane.within, "node set")
         on_plane &= np.isin(np.arange(len(mesh.nodes)), parent)
@@ -173,8 +175,9 @@ def _on_plane(
     if not hits.any():
         low, high = coordinate.min(), coordinate.max()
         inside = f" in '{plane.within}'" if plane.within else ""
+        at = f"{first:g}" if first == last else f"{first:g} to {last:g}"
         raise InputError(
-            f"no {member} at {plane.axis} = {plane.at:g} mm{inside}; the body is between {low:g} "
+            f"no {member} at {plane.axis} = {at} mm{inside}; the body is between {low:g} "
             f"and {high:g}"
         )
     return hits

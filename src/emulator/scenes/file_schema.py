@@ -20,12 +20,12 @@ from emulator.scenes.supports import SUPPORTS, BoundaryCondition
 
 
 class Plane(Table):
-    """Nodes or facets on the plane ``axis = at`` mm."""
+    """Nodes or facets on the plane ``axis = at`` mm, or between two such planes."""
 
     axis: Literal["x", "y", "z"]
     """the plane's normal."""
-    at: float
-    """its coordinate on that axis, mm."""
+    at: float | tuple[float, float]
+    """its coordinate on that axis, mm; or two, between which nodes are taken."""
     within: str | None = None
     """a node set; only its nodes on the plane are taken, such as the edge of a face."""
 

@@ -47,9 +47,11 @@ def init(arguments: Namespace) -> Answer:
         "parameters": list(scene.parameter_names),
         "notes": list(draft.notes),
     }
+    sets = [f"{n} ({k} facets)" for n, k in facets.items()]
+    sets += [f"{n} ({len(k)} nodes)" for n, k in mesh.node_sets.items() if n not in facets]
     lines = [
         f"{len(mesh.nodes)} nodes, {len(mesh.elements)} tetrahedra",
-        f"sets: {', '.join(f'{n} ({k} facets)' for n, k in facets.items()) or 'none'}",
+        f"sets: {', '.join(sets) or 'none'}",
         *draft.notes,
         f"written to {draft.path}; look for CHANGE in it, then: calibrate simulate {draft.path}",
     ]

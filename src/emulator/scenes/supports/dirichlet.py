@@ -9,7 +9,7 @@ between plates. All supports of a scene together leave no rigid motion of the bo
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import ClassVar, override
@@ -115,23 +115,30 @@ def prescribe(mesh: Mesh, supports: Sequence[BoundaryCondition]) -> Prescribed:
     return Prescribed(frozen_array(components, bool), fixed, MappingProxyType(per_unit))
 
 
-def check_motions(mesh: Mesh, supports: Sequence[BoundaryCondition]) -> None:
-    """Refuse supports that let a connected part of the body move or turn."""
-    resisted = [support.resisted(mesh) for support in supports]
+def loose_parts(
+    mesh: Mesh, supports: Sequence[BoundaryCondition]
+) -> Iterator[tuple[np.ndarray, int]]:
+    """Yield the nodes of each connected part that can move or turn, and its free rigid motions."""
+    none = np.empty((0, 3))
+    resisted = [(none, none), *(support.resisted(mesh) for support in supports)]
     points, directions = map(np.concatenate, zip(*resisted, strict=True))
     part = parts(mesh.elements, len(mesh.nodes))
     owner = part[cKDTree(mesh.nodes).query(points)[1]]
     for k in range(part.max() + 1):
-        free = _free_motions(points[owner == k], directions[owner == k])
-        if not free:
-            continue
+        if free := _free_motions(points[owner == k], directions[owner == k]):
+            yield np.flatnonzero(part == k), free
+
+
+def check_motions(mesh: Mesh, supports: Sequence[BoundaryCondition]) -> None:
+    """Refuse supports that let a connected part of the body move or turn."""
+    for nodes, free in loose_parts(mesh, supports):
         who = "its supports leave"
-        if part.any():
-            inside = mesh.nodes[part == k]
-            x, y, z = inside.mean(axis=0)
+        if len(nodes) < len(mesh.nodes):
+            x, y, z = mesh.nodes[nodes].mean(axis=0)
+            count = parts(mesh.elements, len(mesh.nodes)).max() + 1
             who = (
-                f"the mesh has {part.max() + 1} parts, and supports leave the one of "
-                f"{len(inside)} nodes about ({x:.3g}, {y:.3g}, {z:.3g}) mm"
+                f"the mesh has {count} parts, and supports leave the one of "
+                f"{len(nodes)} nodes about ({x:.3g}, {y:.3g}, {z:.3g}) mm"
             )
         raise InputError(
             f"{who} {free} of the 6 rigid motions free, the body could move "

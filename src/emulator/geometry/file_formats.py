@@ -1,0 +1,252 @@
+"""The content of mesh files as meshio has it, also of formats that it reads in part.
+
+These are Gmsh's format 4 with entities that stand reversed in their group or in none, Abaqus, and
+VTK's PolyData. What a file has and its content lacks is listed in ``content.info``.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+import tempfile
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import meshio
+import numpy as np
+from meshio import _helpers
+from meshio._common import num_nodes_per_cell
+from meshio.abaqus import _abaqus
+from meshio.gmsh import _gmsh40, _gmsh41
+from meshio.vtu import _vtu
+
+from emulator.core.errors import InputError
+
+# Corners of the faces of Abaqus's tetrahedra, and types of elements that meshio does not know.
+_FACES = {"S1": (0, 1, 2), "S2": (0, 3, 1), "S3": (1, 3, 2), "S4": (2, 3, 0)}
+_TYPES = {"C3D4H": "tetra", "C3D4T": "tetra", "C3D10HS": "tetra10", "M3D3": "triangle"}
+
+
+def read_cells(path: Path) -> meshio.Mesh:
+    """Return the content of a file as meshio has it; :class:`InputError` where it cannot."""
+    if not path.is_file():
+        what = "is a folder; name a file in it" if path.is_dir() else "does not exist"
+        raise InputError(f"mesh file {path} {what}")
+    if not path.stat().st_size:
+        raise InputError(f"mesh file {path} is empty")
+    try:
+        return _reader(path)(path)
+    except Exception as error:  # meshio's readers raise many types
+        reason = " ".join(str(error).split())[:160] or type(error).__name__
+        raise InputError(f"mesh file {path} cannot be read as a mesh: {reason}") from error
+
+
+def _read(path: Path) -> meshio.Mesh:
+    """Return what the first of meshio's readers for the suffix makes of a file.
+
+    meshio.read prints why its readers refuse a file, and exits; standard output could only be
+    caught for all threads.
+    """
+    reasons = []
+    for kind in _helpers._filetypes_from_path(path):
+        try:
+            # In a text file of STL it takes letters for a number of triangles, which overflows.
+            with np.errstate(over="ignore"):
+                return _helpers.reader_map[kind](str(path))
+        except meshio.ReadError as error:
+            reasons.append(f"not valid {kind}: {error}".removesuffix(": "))
+    raise InputError("; ".join(reasons))
+
+
+def _reader(path: Path) -> Callable[[Path], meshio.Mesh]:
+    """Return what reads the file, by its suffix and its first bytes."""
+    with path.open("rb") as file:
+        head = file.read(1000)
+    suffix = path.suffix.lower()
+    if suffix == ".msh" and head.lstrip().startswith(b"$NOD"):
+        raise InputError("it has Gmsh's format 1, not 2 or 4; gmsh -save -format msh41 converts it")
+    if suffix == ".vtk" and re.search(rb"DATASET\s+POLYDATA", head):
+        return _read_polydata
+    own = {".msh": _read_gmsh, ".inp": _read_abaqus, ".vtp": _read_vtp}
+    return own.get(suffix, _read)
+
+
+def _unsigned(original: Callable[..., Any], *arguments: Any) -> Any:
+    """Return entities as meshio's reader of Gmsh's format 4, their tags without sign, 0 for none.
+
+    A negative tag says that an entity stands reversed in its group. Of an entity in no group meshio
+    would drop the tags, and take the others for those of other cells.
+    """
+    found = original(*arguments)
+    for of_entities in found[0] if isinstance(found[0], tuple) else found:
+        for entity, tags in of_entities.items():
+            of_entities[entity] = [abs(int(tag)) for tag in tags] or [0]
+    return found
+
+
+for _module in (_gmsh40, _gmsh41):
+    _module._read_entities = partial(_unsigned, _module._read_entities)
+
+
+def _read_gmsh(path: Path) -> meshio.Mesh:
+    """Return a Gmsh file. In format 2, ``Mesh.SaveAll = 1`` leaves only the names of groups."""
+    content = _read(path)
+    tags = content.cell_data.get("gmsh:physical", [])
+    if content.field_data and not any(np.any(each) for each in tags):
+        names = ", ".join(content.field_data)
+        content.info = [f"groups {names}, which are empty (save them with Mesh.SaveAll = 0)"]
+    return content
+
+
+def _read_vtp(path: Path) -> meshio.Mesh:
+    """Return the polygons of VTK's PolyData in XML."""
+    try:
+        root = ElementTree.parse(path).getroot()
+    except ElementTree.ParseError:  # raw data after the tree
+        root = _vtu._parse_raw_binary(str(path))
+    root.attrib |= {"type": "UnstructuredGrid", "version": "1.0"}
+    for grid in root.iter("PolyData"):
+        grid.tag = "UnstructuredGrid"
+    for piece in root.iter("Piece"):
+        piece.set("NumberOfCells", count := piece.get("NumberOfPolys", "0"))
+        for child in [child for child in piece if child.tag not in ("Points", "Polys")]:
+            piece.remove(child)
+        for polygons in piece.iter("Polys"):
+            polygons.tag = "Cells"
+            kinds = {"type": "UInt8", "Name": "types", "format": "ascii"}
+            ElementTree.SubElement(polygons, "DataArray", kinds).text = "7 " * int(count)
+    return _polygons(ElementTree.tostring(root), ".vtu")
+
+
+def _read_polydata(path: Path) -> meshio.Mesh:
+    """Return the polygons of VTK's PolyData in a legacy file, which comes without its data."""
+    text = re.sub(rb"DATASET\s+POLYDATA", b"DATASET UNSTRUCTURED_GRID", path.read_bytes(), count=1)
+    text = re.split(rb"\n(?:POINT|CELL)_DATA\s+\d+\s*\n", text, maxsplit=1)[0]
+    found = re.search(rb"\nPOLYGONS\s+(\d+)", text)
+    if found is None or re.search(rb"\n(VERTICES|LINES|TRIANGLE_STRIPS)\s+\d", text):
+        raise InputError("it has no polygons, or also points, lines or strips; keep the triangles")
+    text = text.replace(b"\nPOLYGONS", b"\nCELLS", 1)
+    count = int(found[1]) - text.splitlines()[0].strip().endswith(b"5.1")  # there, of offsets
+    binary = text.splitlines()[2].strip().upper() == b"BINARY"
+    kinds = np.full(count, 7, ">i4").tobytes() if binary else b"7 " * count
+    return _polygons(text + b"\n\nCELL_TYPES %d\n" % count + kinds + b"\n", ".vtk")
+
+
+def _polygons(text: bytes, suffix: str) -> meshio.Mesh:
+    """Return the content of a file of polygons, those of three corners as triangles."""
+    with tempfile.TemporaryDirectory() as folder:
+        (path := Path(folder) / f"polygons{suffix}").write_bytes(text)
+        content = _read(path)
+    kinds = {3: "triangle", 4: "quad"}
+    cells = [(kinds.get(each.data.shape[1], "polygon"), each.data) for each in content.cells]
+    return meshio.Mesh(content.points, cells)
+
+
+def _read_abaqus(path: Path) -> meshio.Mesh:
+    """Return nodes, elements, sets and surfaces of an Abaqus input file with one part.
+
+    Members of sets are numbers, ranges and sets; sets of solid elements become cell data, faces of
+    elements become triangles. Coordinates are those of the part.
+    """
+    nodes: dict[str, list[str]] = {}
+    elements: dict[str, dict[str, list[str]]] = {}  # by meshio's type
+    sets: dict[str, dict[str, list[Any]]] = {"NSET": {}, "ELSET": {}, "FACES": {}}
+    names: dict[str, str] = {}  # as first written: Abaqus does not mind their case
+    info: dict[str, None] = {}  # what was not understood
+
+    def numbers(kind: str, name: str) -> list[str]:
+        of_set = []
+        for word in sets[kind].get(name, [name]):
+            member = word.rpartition(".")[2].upper()  # without the instance
+            if member in sets[kind] and member != name:
+                of_set += numbers(kind, member)
+            elif member.isdigit():
+                of_set.append(member)
+            else:
+                info[f"'{word}' in {names.get(name, name)}"] = None
+        return of_set
+
+    for keyword, options, rows in _sections(path):
+        kind, name = keyword, options.get(keyword, "")
+        members: list[Any] = [row[0] for row in rows]
+        if keyword == "NODE":
+            kind, name = "NSET", options.get("NSET", "")
+            for number, *xyz in rows:
+                if nodes.setdefault(number, xyz) != xyz:
+                    raise InputError(f"node {number} is at two places, as of two parts; export one")
+        elif keyword == "ELEMENT":
+            kind, name = "ELSET", options.get("ELSET", "")
+            code = options.get("TYPE", "").upper()
+            cell = {**_abaqus.abaqus_to_meshio_type, **_TYPES}.get(code)
+            if cell is None:
+                info[f"elements {code}"] = None
+                continue
+            words = np.array([word for row in rows for word in row if word])
+            rows = words.reshape(-1, 1 + num_nodes_per_cell[cell]).tolist()
+            members = [row[0] for row in rows]
+            elements.setdefault(cell, {}).update({row[0]: row[1:] for row in rows})
+        elif keyword == "SURFACE":
+            name, of_nodes = options.get("NAME", ""), options.get("TYPE", "").upper() == "NODE"
+            kind = "NSET" if of_nodes else "FACES"
+            members = members if of_nodes else rows
+        elif "GENERATE" in options:
+            steps = [[int(word) for word in row if word] for row in rows]
+            members = [str(k) for a, b, *by in steps for k in range(a, b + 1, *by)]
+        else:
+            members = [word for row in rows for word in row if word]
+        if kind in sets and name:
+            sets[kind].setdefault(name.upper(), []).extend(members)
+            names.setdefault(name.upper(), name)
+    of_set = {name: numbers("ELSET", name) for name in sets["ELSET"]}
+    corners = {k: own for of_kind in elements.values() for k, own in of_kind.items()}
+    for name, rows in sets["FACES"].items():
+        faces = {
+            f"{name} {k} {face}": [corners[k][c] for c in _FACES[face.upper()]]
+            for which, face in ((row[0], row[-1]) for row in rows)
+            for k in numbers("ELSET", which.upper())
+            if face.upper() in _FACES and len(corners.get(k, ())) in (4, 10)
+        }
+        if not faces:
+            info[f"surface {names[name]}, which has no faces S1 to S4"] = None
+        elements.setdefault("triangle", {}).update(faces)
+        of_set[name] = [*of_set.get(name, ()), *faces]
+    place = {number: k for k, number in enumerate(nodes)}
+    elements = {kind: of_kind for kind, of_kind in elements.items() if of_kind}
+    data = {}
+    for name, own in of_set.items():
+        member = {kind: np.isin([*each], own).astype(int) for kind, each in elements.items()}
+        solid = not any(each.any() for kind, each in member.items() if kind.startswith("tri"))
+        data[names[name] if solid else f"set:{names[name]}"] = [*member.values()]
+    return meshio.Mesh(
+        np.array([[float(word or 0) for word in xyz[:3]] for xyz in nodes.values()]),
+        {
+            kind: np.array([[place[k] for k in own] for own in of_kind.values()])
+            for kind, of_kind in elements.items()
+        },
+        cell_data=data,
+        point_sets={
+            names[name]: np.array([place[k] for k in numbers("NSET", name) if k in place], int)
+            for name in sets["NSET"]
+        },
+        info=[*info],
+    )
+
+
+def _sections(path: Path) -> Iterator[tuple[str, dict[str, str], list[list[str]]]]:
+    """Yield keyword, options and rows of words of each section of an Abaqus input file."""
+    lines = [line.strip() for line in path.read_text("utf-8", errors="replace").splitlines()]
+    lines = [line for line in lines if line and not line.startswith("**")]
+    starts = [k for k, line in enumerate(lines) if line.startswith("*")]
+    for start, end in itertools.pairwise([*starts, len(lines)]):
+        rows = [[word.strip(' "') for word in line.split(",")] for line in lines[start:end]]
+        head = rows.pop(0)
+        while not head[-1] and rows:  # goes on in the next line
+            head = [*head[:-1], *rows.pop(0)]
+        pairs = [word.partition("=") for word in head[1:]]
+        options = {key.strip().upper(): value.strip(' "') for key, _, value in pairs}
+        if head[0].upper() == "*INCLUDE":
+            yield from _sections(path.parent / options.get("INPUT", ""))
+        yield head[0][1:].strip().upper(), options, rows
