@@ -21,6 +21,7 @@ from emulator.scenes import Scene
 
 SHARED = ROOT.parent / "shared"
 PUBLISHED, MEASURED = SHARED / "published", SHARED / "measured"
+CASES = SHARED / "cases"
 
 
 @pytest.fixture(scope="session")
@@ -37,6 +38,14 @@ def measured() -> Path:
     if not MEASURED.is_dir():
         pytest.skip(f"no measurements at {MEASURED.parent.name}/{MEASURED.name}")
     return MEASURED
+
+
+@pytest.fixture(scope="session")
+def cases() -> Path:
+    """Folder of inputs as users bring them; the test is skipped where it is absent."""
+    if not CASES.is_dir():
+        pytest.skip(f"no inputs of users at {CASES.parent.name}/{CASES.name}")
+    return CASES
 
 
 @pytest.fixture(scope="session")

@@ -32,6 +32,7 @@ from emulator.scenes.supports.dirichlet import Support, loose_parts
 
 _METRES = 0.6  # a body smaller than this in all directions is taken to be in m
 _SMALL = 25.0  # a body smaller than this might be in cm
+_MICROMETRES = 3000.0  # a body larger than this in one direction is taken to be in um
 # What names of sets contain, the likeliest first, in words of small letters.
 _NO_WALL = r"^(?!.*(endo|epi|cavity|lumen|inner|inside|outer|outside)).*"
 _SUPPORTS = (
@@ -86,8 +87,8 @@ def draft_scene(
     ----------
     mesh_path : the mesh file.
     out : the scene file, which must not exist yet.
-    unit : unit of the mesh file, ``mm``, ``cm`` or ``m``; guessed from the size by default. A mesh
-        that is not in mm is written again in mm, beside the scene file.
+    unit : unit of the mesh file, ``mm``, ``cm``, ``m`` or ``um``; guessed from the size by
+        default. A mesh that is not in mm is written again in mm, beside the scene file.
     law : name of the law; by default Holzapfel-Ogden where the mesh has fibres, or walls between
         which fibres can be computed, else Neo-Hookean.
 
@@ -108,7 +109,7 @@ def draft_scene(
     notes: list[str] = []
     if unit is None:
         extent = float(np.ptp(body.mesh.nodes, axis=0).max())
-        unit = "mm" if extent >= _METRES else "m"
+        unit = "um" if extent > _MICROMETRES else "mm" if extent >= _METRES else "m"
         hint = "; if it is in cm, give --unit cm" if unit == "mm" and extent < _SMALL else ""
         notes.append(f"the body is {extent:.4g} long: taken to be {unit}{hint}")
     out.parent.mkdir(parents=True, exist_ok=True)

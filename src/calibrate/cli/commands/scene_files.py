@@ -21,7 +21,7 @@ from emulator.core.store import check_folder, to_json
 @command(
     option("mesh", "MESH", "mesh file of tetrahedra"),
     option("--out", "FILE.toml", "scene file to write (default: beside the mesh)"),
-    option("--unit", "mm|cm|m", "of the mesh's coordinates (default: guessed, and said)"),
+    option("--unit", "mm|cm|m|um", "of the mesh's coordinates (default: guessed, and said)"),
     option("--law", "NAME", "default: by whether there are fibres"),
     help="a first scene file for your mesh",
     description="Reads a mesh (gmsh, VTU and whatever meshio reads), says which sets it has, "
@@ -81,7 +81,7 @@ _PLACE = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
         type=int,
         default=0,
     ),
-    option("--unit", "mm|cm|m", "of the surfaces' coordinates (default: mm)", default="mm"),
+    option("--unit", "mm|cm|m|um", "of the surfaces' coordinates (default: mm)", default="mm"),
     option("--picture", "FILE.png", "the mesh, by the wall's thickness"),
     help="tetrahedra between the two surfaces of a left ventricle",
     description="Cuts both surfaces at the base, meshes the wall between them by Gmsh and "

@@ -1,0 +1,72 @@
+"""Inputs as users bring them, by the command line."""
+
+import numpy as np
+import pytest
+
+from calibrate.cli import main
+from cli_support import answer
+
+
+@pytest.mark.slow
+def test_a_round_body_without_sets_is_held(cases, tmp_path, capsys):
+    out = tmp_path / "organ.toml"
+    code, told = answer(capsys, "init", cases / "no_sets_round_body/organ.msh", "--out", out)
+    assert code == 0
+    assert any("held where x is between" in note for note in told["notes"])
+    assert "[node_sets.held]   # CHANGE" in out.read_text()
+    code, solved = answer(capsys, "simulate", out)
+    assert code == 0
+    (force,) = solved["reactions"].values()
+    np.testing.assert_allclose(force, [0.0, 0.0, 1646.4], atol=0.1)  # its weight
+    assert main(["check", "mesh", str(out), "--out", str(tmp_path / "mesh")]) == 0
+
+
+@pytest.mark.parametrize("name", ["plain", "curve", "face"])
+def test_entities_reversed_in_their_group(cases, tmp_path, capsys, name):
+    mesh = cases / f"negative_physical_tag/{name}.msh"
+    code, told = answer(capsys, "init", mesh, "--out", tmp_path / "block.toml")
+    assert code == 0
+    assert told["facet_sets"] == {"left": 90, "right": 90}
+    assert told["node_sets"]["edge"] == 13
+    assert "held at 'left'" in told["notes"]
+
+
+@pytest.mark.parametrize(
+    ("name", "law"), [("converted", "neo_hookean"), ("tags_and_fiber", "holz")]
+)
+def test_sets_from_whole_numbers(cases, tmp_path, capsys, name, law):
+    mesh = cases / f"integer_tags/{name}.vtu"
+    code, told = answer(capsys, "init", mesh, "--out", tmp_path / "block.toml")
+    assert code == 0
+    assert told["facet_sets"] == {"1": 90, "2": 90}
+    assert told["law"].startswith(law)
+
+
+def test_all_saved_by_gmsh(cases, tmp_path, capsys):
+    mesh = cases / "gmsh_save_all/saveall_41.msh"
+    code, told = answer(capsys, "init", mesh, "--out", tmp_path / "41.toml")
+    assert (code, told["facet_sets"]) == (0, {"fixed": 90})
+    mesh = cases / "gmsh_save_all/saveall_22.msh"
+    code, told = answer(capsys, "init", mesh, "--out", tmp_path / "22.toml")
+    assert (code, told["facet_sets"]) == (0, {})
+    assert any("save them with Mesh.SaveAll = 0" in note for note in told["notes"])
+
+
+@pytest.mark.parametrize(
+    ("name", "more"),
+    [
+        ("A_plain", {"loaded"}),
+        ("B_nset_on_node", set()),
+        ("G_surface", {"load"}),
+        ("H_setofsets", {"a", "b"}),
+    ],
+)
+def test_sets_of_abaqus(cases, tmp_path, capsys, name, more):
+    mesh = cases / f"abaqus_sets/{name}.inp"
+    assert main(["init", str(mesh), "--out", str(tmp_path / "lines.toml")]) == 0
+    assert "fixed (25 nodes)" in capsys.readouterr().out
+    code, told = answer(capsys, "init", mesh, "--out", tmp_path / "block.toml")
+    assert code == 0
+    assert set(told["node_sets"]) == {"fixed", *more}
+    assert told["node_sets"]["fixed"] == 25
+    assert "held at 'fixed'" in told["notes"]
