@@ -86,17 +86,21 @@ def predicted(
     """Quantiles (3, j) in N of what would be measured in a mode."""
     rows = rng.choice(len(weights), count, p=weights / weights.sum())
     mean, omega = found.draws["means"][rows, mode], found.draws["omega"][rows]
-    measured = replicated(np.asarray(found.of.amounts[mode]), mean, omega, rng)
+    amounts = np.asarray(found.of.amounts[mode])
+    measured = replicated(amounts, mean, omega, rng.normal(size=mean.shape))
     return np.quantile(measured, _LEVELS, axis=0)
 
 
 def replicated(
-    amounts: np.ndarray, mean: np.ndarray, omega: np.ndarray, rng: np.random.Generator
+    amounts: np.ndarray, mean: np.ndarray, omega: np.ndarray, z: np.ndarray
 ) -> np.ndarray:
-    """What would be measured (d, j) in N, of forces ``mean`` (d, j) off by ``omega`` (d,)."""
+    """What would be measured (d, j) in N, of forces ``mean`` (d, j) off by ``omega`` (d,).
+
+    z : standard normals (d, j).
+    """
     covariance = covariances(*map(jnp.asarray, (amounts, mean, omega[:, None, None])))
     half = np.linalg.cholesky(np.asarray(covariance))
-    return mean + (half @ rng.normal(size=mean.shape)[..., None])[..., 0]
+    return mean + (half @ z[..., None])[..., 0]
 
 
 def summed(told: dict[str, Prediction]) -> Case:

@@ -33,7 +33,8 @@ def twin(found: Campaign, test: int, rng: np.random.Generator) -> Heart:
     forces = found.by_fem[test] * np.asarray(found.cubes.finer).reshape(len(MODES), -1)
     for mode, force in zip(MODES, forces, strict=True):
         curve = heart.curves[mode]
-        made = replicated(curve.amount, force[None], np.array([omega]), rng)[0]
+        z = rng.normal(size=(1, len(force)))
+        made = replicated(curve.amount, force[None], np.array([omega]), z)[0]
         curves[mode] = replace(curve, force=made)
     return replace(heart, curves=curves)
 

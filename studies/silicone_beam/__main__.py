@@ -17,6 +17,7 @@ from studies.silicone_beam.experiment import BLIND, FORCE, Measured, measured, r
 
 import calibrate as cal
 import emulator as em
+from calibrate.cli.output import table
 from calibrate.figures import pyplot
 from calibrate.model_error import ModelError
 from emulator.core.errors import InputError
@@ -138,6 +139,16 @@ def judge(results: Results, folder: Path) -> Case:
     return found | {"measured": places.round(3).tolist()}
 
 
+def _told(case: Case) -> str:
+    """The table of :func:`judge`."""
+    rows = [
+        (name, f"{told['inside']} of {told['of']}", *np.sum(told["each"], axis=0))
+        for name, told in case.items()
+        if isinstance(told, dict)
+    ]
+    return table(("prediction", "inside 90 % bands", *_AXES), rows)
+
+
 def figure(
     cases: Mapping[str, Case], draws: Mapping[str, np.ndarray], seen: Measured, out: Path
 ) -> None:
@@ -182,7 +193,7 @@ def main() -> None:
     words = arguments.parse_args()
     results = Results(words.out, SEED, again=words.again, settings={"quick": words.quick})
     if words.judge is not None:
-        results.case("judged", lambda: judge(results, words.judge))
+        print(_told(results.case("judged", lambda: judge(results, words.judge))))
         return
     if words.data is None:
         arguments.error("give --data DIR, the folder of the recordings (README)")
