@@ -40,7 +40,8 @@ def read_cells(path: Path) -> meshio.Mesh:
     try:
         return _reader(path)(path)
     except Exception as error:  # meshio's readers raise many types
-        reason = " ".join(str(error).split())[:160] or type(error).__name__
+        unknown = f"{error.args[0]} is not defined" if isinstance(error, KeyError) else ""
+        reason = unknown or " ".join(str(error).split())[:160] or type(error).__name__
         raise InputError(f"mesh file {path} cannot be read as a mesh: {reason}") from error
 
 
@@ -184,8 +185,10 @@ def _read_abaqus(path: Path) -> meshio.Mesh:
             if cell is None:
                 info[f"elements {code}"] = None
                 continue
-            words = np.array([word for row in rows for word in row if word])
-            rows = words.reshape(-1, 1 + num_nodes_per_cell[cell]).tolist()
+            words, width = [w for row in rows for w in row if w], 1 + num_nodes_per_cell[cell]
+            if len(words) % width:
+                raise InputError(f"an element {code} has not {width - 1} nodes")
+            rows = np.reshape(words, (-1, width)).tolist()
             members = [row[0] for row in rows]
             elements.setdefault(cell, {}).update({row[0]: row[1:] for row in rows})
         elif keyword == "SURFACE":

@@ -55,6 +55,8 @@ def read_sets(
             facet_sets[name] = surface[places]
     node_sets = {name: np.unique(rows) for name, rows in facet_sets.items()}
     for name, groups in points.items():
+        if name in facet_sets and name.isdigit():
+            continue  # Gmsh numbers groups of points, lines and triangles by themselves
         nodes = np.unique(np.concatenate(groups, axis=None))
         node_sets[name] = nodes[nodes >= 0]
     return {name: nodes for name, nodes in node_sets.items() if nodes.size}, facet_sets, inner
@@ -64,8 +66,7 @@ def _groups(content: meshio.Mesh) -> Iterator[tuple[str, np.ndarray]]:
     """Yield the name and the corners (k, 1, 2 or 3) of every group of points, lines, triangles."""
     pairs = {name: entry for name, entry in content.field_data.items() if np.size(entry) == 2}
     names = {tuple(map(int, entry)): name for name, entry in pairs.items()}
-    of_tag = getattr(content, "cell_tags", {})  # of MED: a tag's groups
-    array = tag_array(content)
+    array, of_tag = tag_array(content)
     for k, block in enumerate(content.cells):
         if block.dim == 3:
             continue
@@ -77,7 +78,9 @@ def _groups(content: meshio.Mesh) -> Iterator[tuple[str, np.ndarray]]:
             if name.startswith(MARK):
                 yield name.removeprefix(MARK), corners[np.flatnonzero(data[k])]
         tags = np.ravel(content.cell_data[array][k] if array else [])
-        for tag in np.unique(tags[(tags != 0) & (tags < _UNMARKED)]).astype(int).tolist():
+        for tag in np.unique(tags[tags < _UNMARKED]).astype(int).tolist():
+            if tag in (0, -1) and tag not in of_tag:
+                continue
             if array == TAG and names and (tag, block.dim) not in names:
                 raise InputError(
                     f"physical group {tag} ({_PLURAL[block.dim]}) has no name of its own; "
@@ -92,20 +95,26 @@ def _groups(content: meshio.Mesh) -> Iterator[tuple[str, np.ndarray]]:
             yield name.removeprefix(MARK), np.flatnonzero(data)[:, None]
 
 
-def tag_array(content: meshio.Mesh) -> str | None:
-    """Return the cell data that numbers groups: Gmsh's, or the first that numbers triangles."""
-    faces = [k for k, block in enumerate(content.cells) if block.dim == 2]
+def tag_array(content: meshio.Mesh) -> tuple[str | None, dict[int, list[str]]]:
+    """Return the cell data that numbers groups, and names of groups by their number, if it has any.
+
+    It is Gmsh's, or the first that numbers triangles. MED has names, and meshio writes its sets as
+    one array from -1, for none, called by all names.
+    """
     if TAG in content.cell_data and any(np.any(each) for each in content.cell_data[TAG]):
-        return TAG
+        return TAG, {}
+    faces = np.concatenate([np.full(len(each.data), each.dim == 2) for each in content.cells])
     for name, data in content.cell_data.items():
-        numbers = np.concatenate([np.ravel(data[k]) for k in faces] or [np.empty(0)])
-        if name.startswith(MARK) or name.endswith(_OF_GMSH) or not numbers.any():
+        numbers = np.concatenate([np.ravel(each) for each in data])
+        if name.startswith(MARK) or name.endswith(_OF_GMSH) or len(numbers) != len(faces):
             continue
-        of_faces = sum(len(content.cells[k].data) for k in faces)
-        whole = len(numbers) == of_faces and (numbers == np.round(numbers)).all()
-        if whole and len(np.unique(numbers)) <= min(_MOST, 0.5 * of_faces):
-            return name
-    return None
+        parts, of_faces = name.split("-"), numbers[faces]
+        if faces.any() and (numbers.min(), numbers.max()) == (-1, len(parts) - 1):
+            return name, {k: [part] for k, part in enumerate(parts)}
+        whole = of_faces.any() and (of_faces == np.round(of_faces)).all()
+        if whole and len(np.unique(of_faces)) <= min(_MOST, 0.5 * len(of_faces)):
+            return name, getattr(content, "cell_tags", {})
+    return None, {}
 
 
 def unused(content: meshio.Mesh, kind: str, used: Collection[str | None]) -> list[str]:

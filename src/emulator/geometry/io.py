@@ -96,7 +96,7 @@ def read_body(source: str | Path | Any, *, quadratic: bool = False) -> Body:
         mesh, numbers, left = _mesh(content)
         order = 2 if quadratic else mesh.order
         found: dict[str, np.ndarray | None] = dict.fromkeys(_NAMES)
-        used = [tag_array(content)]
+        used = [tag_array(content)[0]]
         for kind, pattern in _NAMES.items():
             names = (kind, *content.cell_data, *content.point_data)
             for name in (each for each in names if re.fullmatch(pattern, each, re.IGNORECASE)):

@@ -45,6 +45,7 @@ _INSIDE = ("endo", "cavity", "lumen", "inner", "inside", r"\blv\b", "left ventri
 _OUTSIDE = ("epi", "outer", "outside", "pericard", r"\bwall\b")
 _LEAST_FACE = 0.005  # of the surface; a flat face this large holds the body
 _LEAST_END = 0.15  # likewise of an end that is not flat
+_FLAT = 1e-8  # of the body's size
 # Ranges of known parameters: the paper's, textbook form.
 _RANGES = {
     "a": (0.2, 0.52),
@@ -259,28 +260,28 @@ def _support(mesh: Mesh, notes: list[str]) -> str:
 def _end(mesh: Mesh, nodes: np.ndarray) -> tuple[str, float | list[float], str]:
     """Return where to hold the part of these nodes: axis, one or two coordinates mm, and words.
 
-    On the flat face where its longest axis is least; or on its largest flat face across an axis; or
-    between two planes that cut off its end.
+    On a flat face at an end, the end first where its longest axis is least; or between two planes
+    that cut off that end.
     """
     corners = mesh.nodes[mesh.surface[np.isin(mesh.surface[:, 0], nodes)][:, :3]]
     area = np.linalg.norm(cross_sides(corners), axis=1)
-    low, high = mesh.nodes[nodes].min(axis=0), mesh.nodes[nodes].max(axis=0)
-    longest = int(np.argmax(high - low))
-    ends = [(axis, at) for axis in (longest, 0, 1, 2) for at in (low, high)]
-    flat = [
-        area[(np.abs(corners[..., axis] - at[axis]) <= 1e-8 * mesh.size).all(axis=1)].sum()
-        for axis, at in ends
-    ]
-    best = 0 if flat[0] > _LEAST_FACE * area.sum() else int(np.argmax(flat))
-    axis, at = ends[best]
-    if flat[best] > _LEAST_FACE * area.sum():
-        place = float(at[axis])
-        return "xyz"[axis], place, f"{'least' if at is low else 'greatest'}, {place:.6g}"
-    heights = corners[..., longest].max(axis=1)
-    order = np.argsort(heights)
-    last = np.searchsorted(np.cumsum(area[order]), _LEAST_END * area.sum())
-    between = [float(low[longest]), float(heights[order][last])]
-    return "xyz"[longest], between, f"between {between[0]:.6g} and {between[1]:.6g}"
+    box = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    longest = int(np.argmax(box[1] - box[0]))
+
+    def depth(axis: int, side: int, share: float) -> float:
+        """Return how deep an end is, mm, that has this share of the surface."""
+        depths = np.abs(corners[..., axis] - box[side][axis]).max(axis=1)
+        order = np.argsort(depths)
+        return float(depths[order][np.searchsorted(np.cumsum(area[order]), share * area.sum())])
+
+    for axis in (longest, 0, 1, 2):
+        for side, word in enumerate(("least", "greatest")):
+            if depth(axis, side, _LEAST_FACE) <= _FLAT * mesh.size:
+                place = float(box[side][axis])
+                return "xyz"[axis], place, f"{word}, {place:.6g}"
+    low = float(box[0][longest])
+    high = low + depth(longest, 0, _LEAST_END)
+    return "xyz"[longest], [low, high], f"between {low:.6g} and {high:.6g}"
 
 
 def _loads(mesh: Mesh) -> list[tuple[Load, str, str, float]]:
