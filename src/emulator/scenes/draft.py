@@ -106,6 +106,8 @@ def draft_scene(
         raise InputError(f"{out} is there already; remove it or give --out another name")
     if unit is not None:
         look_up(UNITS, unit, "unit")
+    if law is not None:
+        find_law(law)  # refused before anything is written
     body = read_body(mesh_path)
     notes: list[str] = []
     if unit is None:
@@ -134,10 +136,13 @@ def draft_scene(
         *_elements(mesh),
     ]
     if body.unused:
-        notes.append(f"in the mesh file and not used: {', '.join(body.unused)}")
+        unused = ", ".join(body.unused)
+        if unit != "mm":  # the mesh in mm has no regions
+            unused = re.sub(r' \(regions = "[^"]*"\)', "", unused)
+        notes.append(f"in the mesh file and not used: {unused}")
     sections = ["\n".join(head)]
     if material.fibres and body.fibres is None:
-        sections.append(_fibres(mesh, walls))
+        sections.append(_fibres(mesh, walls, material.sheets))
     for load, lines, note, stiffer in _loads(mesh):
         quantities = _quantities([*material.quantities, *load.quantities], stiffer)
         entries = "\n\n".join([*sections, support, lines, *quantities]) + "\n"
@@ -147,7 +152,7 @@ def draft_scene(
             return Draft(out, read_scene(out), all_notes)
         except InputError as error:
             out.unlink()
-            failure = str(error).replace(str(out), "its scene")
+            failure = re.sub(rf"^scene file {re.escape(str(out))}(, line \d+)?: ", "", str(error))
         notes.append(f"not the load '{load.kind}': {failure}")
     if mesh_name == f"{mesh_path.stem}_mm.vtu" and unit != "mm":
         out.with_name(mesh_name).unlink()
@@ -198,10 +203,11 @@ def _walls(mesh: Mesh) -> tuple[str, str] | None:
     return (inner, outer) if inner and outer else None
 
 
-def _fibres(mesh: Mesh, walls: tuple[str, str] | None) -> str:
+def _fibres(mesh: Mesh, walls: tuple[str, str] | None, with_sheets: bool) -> str:
     """Return the lines of the fibre rule."""
     if walls is None:
-        return '[fibres]   # CHANGE\nrule = "uniform"\ndirection = [1.0, 0.0, 0.0]'
+        sheets = "\nsheets = [0.0, 1.0, 0.0]" if with_sheets else ""
+        return f'[fibres]   # CHANGE\nrule = "uniform"\ndirection = [1.0, 0.0, 0.0]{sheets}'
     base = _find_set(mesh.facet_sets, _SUPPORTS[:1])
     axis = "axis = [0.0, 0.0, 1.0]   # CHANGE: from apex to base"
     if base is not None:

@@ -86,6 +86,19 @@ def test_a_first_scene_of_each_can_be_simulated(tmp_path, capsys, name):
     assert main(["check", "mesh", told["out"], "--out", str(tmp_path / "mesh")]) == 0
 
 
+def test_sets_that_meshio_joins_in_one_array(tmp_path):
+    """Of VTU: all names joined, -1 for cells of no set."""
+    none, count = np.empty(0, int), len(BLOCK.facet_set("left"))
+    content = meshio.Mesh(
+        BLOCK.nodes,
+        [("tetra", BLOCK.elements), ("triangle", SIDES)],
+        cell_sets={"fixed": [none, np.arange(count)], "pulled": [none, count + np.arange(count)]},
+    )
+    meshio.write(tmp_path / "block.vtu", content)
+    mesh = read_mesh(tmp_path / "block.vtu")
+    assert {name: len(rows) for name, rows in mesh.facet_sets.items()} == {"fixed": 8, "pulled": 8}
+
+
 def test_counts_and_marks_of_no_group_are_no_sets(tmp_path):
     """A number for each triangle, and DOLFIN's largest number where nothing is marked."""
     content = tagged("vtkOriginalCellIds", np.arange(len(TAGS)))

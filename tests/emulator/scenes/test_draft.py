@@ -11,6 +11,7 @@ from emulator.core.errors import InputError
 from emulator.geometry.generators.box import box
 from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.geometry.io import write_mesh
+from emulator.geometry.mesh import Mesh
 from emulator.geometry.refinement import to_quadratic
 from emulator.scenes.draft import draft_scene
 from emulator.scenes.fibre_rules import Helix
@@ -127,3 +128,47 @@ def test_linear_tetrahedra_are_kept_from_locking(tmp_path, monkeypatch):
     write_mesh(tmp_path / "quadratic.vtu", to_quadratic(mesh))
     said = draft_scene(tmp_path / "quadratic.vtu", tmp_path / "quadratic.toml")
     assert "lock" not in " ".join(said.notes)
+
+
+def test_round_bodies_and_loose_parts_are_held(tmp_path):
+    """A ball of tetrahedra about its centre has one node at each end; a copy of it is beside it."""
+    block = box((2.0, 2.0, 2.0), (6, 6, 6))
+    centred = block.nodes - 1.0
+    cube, ball = np.abs(centred).max(axis=1), np.linalg.norm(centred, axis=1)
+    nodes = 30.0 * centred * (cube / np.where(ball > 0.0, ball, 1.0))[:, None]
+    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    nodes = nodes @ turn
+    one = replace(block, nodes=nodes, node_sets={}, facet_sets={})
+    two = Mesh(
+        np.concatenate([nodes, nodes + [100.0, 0.0, 0.0]]),
+        np.concatenate([block.elements, block.elements + len(nodes)]),
+    )
+    tip = replace(one, node_sets={"fixed tip": np.array([0])})
+    for name, mesh, count in (("one", one, 1), ("two", two, 2), ("tip", tip, 1)):
+        write_mesh(tmp_path / f"{name}.vtu", mesh)
+        made = draft_scene(tmp_path / f"{name}.vtu", tmp_path / f"{name}.toml")
+        notes = [note for note in made.notes if "held where x is between" in note]
+        assert len(notes) == count
+        assert made.path.read_text().count("# CHANGE: ") >= count
+    assert "'fixed tip' alone leaves the body free to turn or move" in notes[0]
+
+
+def test_large_bodies_get_moduli_that_stand_their_weight(tmp_path):
+    write_mesh(tmp_path / "beam.vtu", replace(box((400.0, 20.0, 20.0), (8, 1, 1)), node_sets={}))
+    made = draft_scene(tmp_path / "beam.vtu", tmp_path / "beam.toml")
+    assert made.scene.parameters[0].low == 50 * 3.5
+
+
+def test_a_refused_draft_leaves_no_file(tmp_path, capsys):
+    mesh = replace(box((4.0, 1.0, 1.0), (4, 2, 2)), node_sets={}, facet_sets={})
+    fibres = np.tile([1.0, 0.0, 0.0], (len(mesh.elements), 1))
+    write_mesh(tmp_path / "b.vtu", mesh, fibres)
+    for law, message in (
+        ("hooke", "'hooke' is unknown"),
+        ("holzapfel_ogden_orthotropic", "sheets"),
+    ):
+        assert main(["init", str(tmp_path / "b.vtu"), "--unit", "cm", "--law", law]) == 2
+        line = capsys.readouterr().err
+        assert message in line
+        assert "b.toml" not in line
+        assert [path.name for path in tmp_path.iterdir()] == ["b.vtu"]

@@ -85,8 +85,8 @@ _PLACE = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
     option("--picture", "FILE.png", "the mesh, by the wall's thickness"),
     help="tetrahedra between the two surfaces of a left ventricle",
     description="Cuts both surfaces at the base, meshes the wall between them by Gmsh and "
-    "names endocardium, epicardium and base, for calibrate init. Surfaces are STL, PLY or OBJ: "
-    "open at the base, or closed, with --axis and a base plane.",
+    "names endocardium, epicardium and base, for calibrate init. Surfaces are STL, PLY, OBJ or "
+    "VTK's PolyData: open at the base, or closed, with --axis and a base plane.",
     epilog="example: calibrate mesh --endocardium endo.stl --epicardium epi.stl --out lv.vtu, "
     "then calibrate init lv.vtu",
 )
