@@ -1,5 +1,7 @@
 """Inputs as users bring them, by the command line."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -70,3 +72,28 @@ def test_sets_of_abaqus(cases, tmp_path, capsys, name, more):
     assert set(told["node_sets"]) == {"fixed", *more}
     assert told["node_sets"]["fixed"] == 25
     assert "held at 'fixed'" in told["notes"]
+
+
+@pytest.mark.slow
+def test_a_corner_of_a_guessed_box_is_no_knowledge(cases, tmp_path, capsys):
+    """Two volumes of a ventricle that is stiffer than the range of a_f allows."""
+    words = ["left_ventricle", "--data", cases / "box_edge/volumes.csv", "--noise", "volume=3"]
+    out = tmp_path / "run"
+    code, told = answer(capsys, "infer", *words, "--no-certify", "--out", out)
+    assert code == 0
+    assert any("a_f at 10.36 kPa" in sentence for sentence in told["warnings"])
+    code, told = answer(capsys, "certify", out, "--no-mesh")
+    assert (code, told["verdict"]) == (1, "not certified")
+    said = json.dumps(told)
+    assert "a corner of the box ends the posterior" in said
+    assert "calibrate train wider:" in said
+    code, told = answer(capsys, "identify", "after", out)
+    assert code == 0
+    assert {end["name"] for end in told["box_ends"]} >= {"a", "a_f"}
+    assert not any("a_f" in entry["exponents"] for entry in told["combinations"])
+    bounded = ["--bounded", "a", "b", "a_f", "b_f"]
+    code, told = answer(
+        capsys, "infer", *words, "--no-certify", *bounded, "--out", tmp_path / "bounded"
+    )
+    assert code == 0
+    assert not any("the box" in sentence for sentence in told["warnings"])

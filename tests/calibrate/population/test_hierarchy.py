@@ -134,9 +134,20 @@ def test_draws_have_names_and_units(found):
     assert set(found.member("b2")) == {"mu", "lam", "noise_sd"}
     assert set(found.member("b0")) == {"mu", "lam"}
     assert found.tree["posterior"]["mu"].attrs["units"] == "kPa"
+    np.testing.assert_array_equal(found.tree["posterior"]["mu"].attrs["box"], [50.0, 100.0])
     assert np.all(np.abs(draws["correlation[mu, lam]"]) < 1.0)
     assert np.all((draws["mu[b1]"] > 50.0) & (draws["mu[b1]"] < 100.0))
     assert "Population of 5 members" in repr(found)
+
+
+def test_a_member_that_wants_more_than_the_range_is_told(found):
+    tree = found.tree.copy()
+    mu = tree["posterior"]["mu"]
+    draws = 100.0 - np.abs(np.random.default_rng(0).normal(size=mu.shape[:2]))
+    mu.values[..., 0] = draws
+    (end, *others) = replace(found, tree=tree).box_ends()
+    assert str(end) == "mu[b0] at 100 kPa"
+    assert not any(other.name.endswith("[b0]") for other in others)
 
 
 def test_a_new_member_is_predicted_through_its_model(found, beam):

@@ -6,6 +6,8 @@ import pytest
 import calibrate as cal
 from calibrate.posterior.box import box_ends, in_words
 from calibrate.posterior.diagnosis import diagnose
+from calibrate.project.run import with_absolute_paths
+from emulator.catalogue import find_scene, scene_from_origin
 from emulator.core.errors import InputError
 from emulator.scenes.parameter_space import Parameter
 from linear_support import linear_forward
@@ -125,6 +127,18 @@ def test_data_that_want_more_than_the_box_are_told(beam, model):
         assert bool(learned["box_ends"]) == (not bounded)
         if not bounded:
             assert not any("mu" in entry["exponents"] for entry in learned["combinations"])
+
+
+def test_a_wider_scene_has_wider_ranges_and_a_name(tmp_path):
+    scene, wider = find_scene("left_ventricle"), find_scene("wider:left_ventricle")
+    for before, after in zip(scene.parameters, wider.parameters, strict=True):
+        assert 0.0 <= after.low < before.low or after.low == before.low == 0.0
+        assert after.high > before.high
+    assert wider.fingerprint != scene.fingerprint
+    assert scene_from_origin(wider.origin).fingerprint == wider.fingerprint
+    assert with_absolute_paths({"scene": "wider:x.toml"}, tmp_path) == {
+        "scene": f"wider:{tmp_path / 'x.toml'}"
+    }
 
 
 def test_a_cut_posterior_is_not_advised_to_narrow_a_prior():
