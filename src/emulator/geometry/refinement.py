@@ -13,7 +13,7 @@ numbers.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,8 +22,18 @@ from scipy.sparse import csr_matrix, identity, vstack
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import from_quadrature_points, quadrature_points, shapes_at
 from emulator.geometry.fibres import from_elements, unit
-from emulator.geometry.mesh import EDGES, SIDES, Mesh, boundary_facets, find_rows, orient
+from emulator.geometry.mesh import (
+    EDGES,
+    SIDES,
+    Mesh,
+    boundary_facets,
+    find_rows,
+    orient,
+    signed_volumes,
+)
 
+_LEAST_JACOBIAN = 0.05  # of the straight element's; curved ones below count as folded
+_LEAST_SHARE = 0.1  # of an edge's curvature; less is none
 Midpoints = Callable[[np.ndarray], np.ndarray]
 
 
@@ -54,6 +64,30 @@ def to_quadratic(mesh: Mesh, midpoints: Midpoints | None = None) -> Mesh:
         {name: grown(nodes) for name, nodes in mesh.node_sets.items()},
         {name: surface[find_rows(rows, mesh.surface)] for name, rows in mesh.facet_sets.items()},
     )
+
+
+def unfolded(mesh: Mesh) -> tuple[Mesh, int]:
+    """Return a curved quadratic mesh without folds, and the number of elements that were folded.
+
+    A folded element's Jacobian is next to nothing or negative at a node or quadrature point. The
+    nodes on its edges are moved halfway to the middles of the edges, as often as it takes.
+    """
+    _, slopes = shapes_at(2, np.concatenate([_NODES, quadrature_points(2)]))
+    edges, middles = mesh.elements[:, EDGES], mesh.elements[:, 4:]
+    chord, share = mesh.nodes.copy(), np.ones((len(mesh.nodes), 1))
+    chord[middles] = mesh.nodes[edges].mean(axis=2)
+    least = _LEAST_JACOBIAN * 6.0 * signed_volumes(mesh.nodes, mesh.elements)
+    folded = np.zeros(len(mesh.elements), dtype=bool)
+    while True:
+        nodes = chord + share * (mesh.nodes - chord)
+        jacobian = np.einsum("mai,qaj->mqij", nodes[mesh.elements], slopes)
+        now = (np.linalg.det(jacobian) < least[:, None]).any(axis=1)
+        now &= share[middles].any(axis=(1, 2))  # what is straight already stays as it is
+        if not now.any():
+            return replace(mesh, nodes=nodes) if folded.any() else mesh, int(folded.sum())
+        folded |= now
+        moved = np.unique(middles[now])
+        share[moved] = np.where(share[moved] > _LEAST_SHARE, 0.5 * share[moved], 0.0)
 
 
 def to_linear(mesh: Mesh) -> Mesh:

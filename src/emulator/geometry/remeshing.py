@@ -36,6 +36,10 @@ from emulator.geometry.surfaces import Surface, one_rim, signed_areas
 _TYPES = {3: 2, 4: 4}  # Gmsh's numbers of element types, by their corners
 
 
+class Unmeshable(InputError):
+    """Surfaces that cannot be meshed with edges of this length."""
+
+
 def triangulate(
     loops: Sequence[np.ndarray], size: float | Callable[[float, float], float]
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -96,7 +100,7 @@ def _cells(gmsh: Any, corners: int) -> tuple[np.ndarray, np.ndarray]:
     order = np.argsort(tags)
     _, rows = gmsh.model.mesh.getElementsByType(_TYPES[corners])
     if not len(rows):
-        raise InputError("gmsh found no elements")
+        raise Unmeshable("gmsh found no elements")
     elements = np.searchsorted(tags[order], rows).reshape(-1, corners)
     return places.reshape(-1, 3)[order], elements
 
@@ -129,7 +133,7 @@ def _model() -> Iterator[Any]:
         raise
     except Exception as error:  # Gmsh raises no other type
         reason = " ".join(str(error).split())[:160]
-        raise InputError(f"gmsh could not mesh it: {reason}") from error
+        raise Unmeshable(f"gmsh could not mesh it: {reason}") from error
     finally:
         if owns_session:
             gmsh.finalize()

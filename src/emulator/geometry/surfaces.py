@@ -161,9 +161,11 @@ def cut(surface: Surface, point: np.ndarray, normal: np.ndarray) -> Surface:
     height[np.abs(height) < _SNAP * surface.extent] = 0.0
     if not (height.min() < 0.0 <= height.max()):
         where = "above" if height.min() >= 0.0 else "below"
+        along = surface.points @ normal
         raise InputError(
-            f"{surface.name}: all of it is {where} the base plane through {place_of(point)}, its "
-            f"heights {height.min():.4g} to {height.max():.4g} mm; expected a plane that cuts it"
+            f"{surface.name}: all of it is {where} the base plane through {place_of(point)}; "
+            f"expected one that cuts it: --base-height between {along.min():.4g} and "
+            f"{along.max():.4g} mm, or --axis the other way round"
         )
     flat = surface.points - np.outer((surface.points - point) @ normal, normal)
     points = np.where((height == 0.0)[:, None], flat, surface.points)
@@ -200,12 +202,13 @@ def one_rim(surface: Surface) -> np.ndarray:
     if not rims:
         raise InputError(
             f"{surface.name}: it is closed; give the base plane, a height along the long axis or a "
-            "point and a normal"
+            "point: --axis with --base-height or --base-point"
         )
     small = surface.points[np.unique(rims[0])].mean(axis=0)
     raise InputError(
         f"{surface.name}: it has {len(rims)} openings, the smallest of {len(rims[0])} edges at "
-        f"{place_of(small)}; expected the base's alone: fill the others"
+        f"{place_of(small)}; expected the base's alone: fill the others, or give --axis and a base "
+        "plane below them, --base-height or --base-point"
     )
 
 

@@ -5,13 +5,13 @@ Both are cut by the base plane, laid out in the disc and meshed anew with even t
 enclose. The long axis is the base plane's normal, from apex to base. Where it is not given it is
 the area vector of the rims, :math:`\frac12 \sum_\text{edges} x_a \times x_b`, and the plane lies
 as low as the lowest point of a rim, so that rims which are not flat, or not at one height, are cut
-off; the result says by how much.
+off; the result says by how much. Above a plane that is given, a surface may have any openings.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,9 +21,9 @@ from scipy.spatial import cKDTree
 from emulator.core.errors import InputError, look_up
 from emulator.geometry.discretisation import MeshQuality, discretise, mesh_quality
 from emulator.geometry.facets import MM3_PER_ML, Cavity
-from emulator.geometry.mesh import SIDES, Mesh, find_rows, orient
-from emulator.geometry.refinement import to_quadratic
-from emulator.geometry.remeshing import DiscMap, tetrahedralise, triangulate
+from emulator.geometry.mesh import SIDES, Mesh, find_rows, orient, signed_volumes
+from emulator.geometry.refinement import to_quadratic, unfolded
+from emulator.geometry.remeshing import DiscMap, Unmeshable, tetrahedralise, triangulate
 from emulator.geometry.surfaces import (
     UNITS,
     Surface,
@@ -40,6 +40,10 @@ _LEAST = 4.0  # mm; nobody's heart is smaller, a mouse's being 7 mm long
 _MOST_CUT = 0.2  # of the epicardium's height: rims that stand further apart are no base
 _SIZE = 0.7  # of the median thickness: some 5000 quadratic nodes for a human ventricle
 _SAME = 1e-3  # of the extent: rims this flat are not cut
+_SMALLER = 1.0, 0.7, 0.5, 0.35  # of the size, tried in turn where a wall is too thin
+_THICK = 20.0, 2.5  # mm and medians; no wall of a left ventricle is thicker than the lesser
+_THICK_SHARE = 0.02  # of the wall, above which its thick part is worth a word
+_FILLED = 0.1, 4.0  # volumes of a left ventricle's cavity over its wall's lie between
 
 
 class Thickness(NamedTuple):
@@ -59,8 +63,11 @@ class Wall:
     axis : (3,) from apex to base, of length 1. base : (3,) mm, the middle of the cavity's rim.
     size : the target edge length, mm. thickness : the thickness of the wall.
     cavity, wall : the volumes in mL, of the mesh and of the surfaces below the base plane.
-    cut_off : the height of the part above the base plane, mm; 0 for closed surfaces.
+    cut_off : the height in mm and the epicardium's volume in mL above the base plane.
     moved : the largest displacement of a point by smoothing, mm.
+    folded : the number of elements that were folded, and the largest displacement in mm of a node
+        that unfolded them.
+    warnings : what is doubtful, a line each.
     """
 
     mesh: Mesh
@@ -70,8 +77,10 @@ class Wall:
     thickness: Thickness
     cavity: tuple[float, float]
     wall: tuple[float, float]
-    cut_off: float
+    cut_off: tuple[float, float]
     moved: float
+    folded: tuple[int, float]
+    warnings: tuple[str, ...]
     quality: MeshQuality
 
     def local_thickness(self) -> np.ndarray:
@@ -90,15 +99,20 @@ class Wall:
             f"wall {self.thickness.least:.3g} to {self.thickness.most:.3g} mm thick, "
             f"median {self.thickness.median:.3g}",
             f"cavity {cavity:.4g} mL, the surface's own {own:.4g} ({100 * (cavity / own - 1):+.2f} "
-            f"%); wall {self.wall[0]:.4g} mL, {self.wall[1]:.4g}",
+            f"%); wall {self.wall[0]:.4g} mL, {self.wall[1]:.4g}; cavity over wall "
+            f"{cavity / self.wall[0]:.3g}",
         ]
-        if self.cut_off > 0.0:
-            lines.append(f"cut off {self.cut_off:.3g} mm above the base plane")
+        if self.cut_off[0] > 0.0:
+            height, volume = self.cut_off
+            lines.append(f"cut off {height:.3g} mm, {volume:.4g} mL, above the base plane")
         if self.moved > 0.0:
             lines.append(f"smoothing moved points by {self.moved:.3g} mm at most")
-        if abs(cavity / own - 1.0) > 0.01:
-            lines.append("the cavity is more than 1 % off: choose a smaller size, or order 2")
-        return [*lines, self.quality.sentence()]
+        if self.folded[0]:
+            lines.append(
+                f"{self.folded[0]} curved elements were folded, and straightened: nodes on their "
+                f"edges moved by {self.folded[1]:.2g} mm at most"
+            )
+        return [*lines, *self.warnings, self.quality.sentence()]
 
 
 def mesh_wall(
@@ -118,7 +132,8 @@ def mesh_wall(
     Parameters
     ----------
     endocardium, epicardium : files of triangles (STL, PLY, OBJ), or surfaces in mm.
-    size : the edge length in mm; 0.7 of the median thickness by default.
+    size : the edge length in mm; by default 0.7 of the median thickness, or less where the wall
+        is too thin for it.
     order : 2 for quadratic elements with curved edges on both surfaces, or 1.
     axis : the base plane's normal, from apex to base, of any length; found from the rims by
         default. Closed surfaces need it.
@@ -133,7 +148,7 @@ def mesh_wall(
     InputError
         A surface that :func:`~emulator.geometry.surfaces.surface` refuses, with holes, or closed
         without a base plane; surfaces that are swapped, apart, or cross; lengths that are not in
-        mm; no Gmsh; or a wall too thin for ``size``.
+        mm; no Gmsh; or a wall too thin for ``size`` mm, or for any.
     """
     if order not in (1, 2):
         raise InputError(f"order {order}: expected 1 or 2")
@@ -146,41 +161,89 @@ def mesh_wall(
     ]
     normal, point = _plane(intact, axis, base_height, base_point)
     below = [cut(each, point, normal) for each in intact]
-    is_open = all(each.rims for each in intact)
-    cut_off = max(((each.points - point) @ normal).max() for each in intact) if is_open else 0.0
+    for each in below:
+        rim = each.points[one_rim(each)] @ normal
+        if rim.min() < point @ normal - _SAME * intact[1].extent:
+            raise InputError(
+                f"{each.name}: its opening reaches below the base plane, down to {rim.min():.4g} "
+                f"mm along the axis, the plane being at {point @ normal:.4g}; expected a lower "
+                "one: --base-height or --base-point"
+            )
+    height = max(((each.points - point) @ normal).max() for each in intact)
+    lost = (intact[1].volume - below[1].volume) / MM3_PER_ML
+    is_cut = height > _SAME * intact[1].extent
     inner, outer = (smoothed(each, smooth) for each in below)
     _check_nested(inner, outer, normal)
     thickness = _thickness(inner, outer)
-    size = _SIZE * thickness.median if size is None else size
-    if not 0.0 < size < intact[1].extent / 4.0:
+    wished = _SIZE * thickness.median if size is None else size
+    if not 0.0 < wished < intact[1].extent / 4.0:
         raise InputError(
-            f"size {size} mm: expected edges above 0 and below a quarter of the epicardium's "
+            f"--size {wished} mm: expected edges above 0 and below a quarter of the epicardium's "
             f"extent, {intact[1].extent:.4g} mm"
         )
-    mesh = _mesh([DiscMap(inner), DiscMap(outer)], size, order, normal, point)
-    cavity, whole = (each.volume / MM3_PER_ML for each in below)
-    try:
-        own = float(discretise(mesh).weights.sum()) / MM3_PER_ML
-    except InputError as error:
+    maps = [DiscMap(inner), DiscMap(outer)]
+    fitting, curved = _mesh_that_fits(maps, wished, order, normal, point)
+    if size is not None and fitting < size:
         raise InputError(
-            f"edges of {size:.3g} mm are too long for such curved surfaces ({error}): choose a "
-            "smaller size, or order 1"
-        ) from error
-    return Wall(
+            f"the wall, {thickness.least:.3g} mm where it is thinnest, is too thin for edges of "
+            f"{size:.3g} mm: --size {fitting:.4g} fits"
+        )
+    mesh, folded = unfolded(curved) if order == 2 else (curved, 0)
+    cavity, whole = (each.volume / MM3_PER_ML for each in below)
+    wall = Wall(
         mesh=mesh,
         axis=normal,
         base=below[0].points[np.unique(one_rim(below[0]))].mean(axis=0),
-        size=float(size),
+        size=float(fitting),
         thickness=thickness,
         cavity=(Cavity(mesh, "endocardium").rest, cavity),
-        wall=(own, whole - cavity),
-        cut_off=float(cut_off) if cut_off > _SAME * intact[1].extent else 0.0,
-        moved=max(
-            float(np.linalg.norm(one.points - other.points, axis=1).max())
-            for one, other in zip((inner, outer), below, strict=True)
-        ),
+        wall=(float(discretise(mesh).weights.sum()) / MM3_PER_ML, whole - cavity),
+        cut_off=(float(height), lost) if is_cut else (0.0, 0.0),
+        moved=_farthest(inner.points, below[0].points, outer.points, below[1].points),
+        folded=(folded, _farthest(mesh.nodes, curved.nodes)),
+        warnings=(),
         quality=mesh_quality(mesh),
     )
+    return replace(wall, warnings=tuple(_doubts(wall, inner.volume / MM3_PER_ML)))
+
+
+def _farthest(*points: np.ndarray) -> float:
+    """Return the largest distance in mm between points (n, 3) of each pair of arrays."""
+    pairs = zip(points[::2], points[1::2], strict=True)
+    return float(max(np.linalg.norm(one - other, axis=1).max() for one, other in pairs))
+
+
+def _doubts(wall: Wall, smooth_cavity: float) -> Iterator[str]:
+    """Yield what is doubtful of a wall, whose smoothed endocardium encloses so many mL."""
+    (cavity, own), (volume, _), (_, lost) = wall.cavity, wall.wall, wall.cut_off
+    if lost > cavity + volume:
+        x, y, z = -wall.axis + 0.0
+        yield (
+            f"the base plane cuts off {lost:.4g} mL and leaves {cavity + volume:.4g}: does the "
+            f"axis lead from apex to base? The other way round: --axis {x:.4g} {y:.4g} {z:.4g} "
+            f"--base-height {-(wall.base @ wall.axis) + 0.0:.4g}"
+        )
+    limit = min(_THICK[0], _THICK[1] * wall.thickness.median)
+    of_elements = wall.local_thickness()[wall.mesh.corners].mean(axis=1)
+    volumes = signed_volumes(wall.mesh.nodes, wall.mesh.elements) / MM3_PER_ML
+    thick = volumes[of_elements > limit].sum()
+    if thick > _THICK_SHARE * volume:
+        yield (
+            f"{thick:.3g} mL between the surfaces are thicker than {limit:.3g} mm: a right "
+            "ventricle? The epicardium should be the left one's"
+        )
+    low, high = _FILLED
+    if not low < cavity / volume < high:
+        least = "less" if cavity < low * volume else "more"
+        yield (
+            f"the cavity is {least} than {low if least == 'less' else high:g} of the wall: are "
+            "both surfaces those of one left ventricle?"
+        )
+    if abs(cavity / smooth_cavity - 1.0) > 0.01:
+        remedy = "a smaller --size, or --order 2" if wall.mesh.order == 1 else "a smaller --size"
+        yield f"the cavity is more than 1 % off: choose {remedy}"
+    elif abs(cavity / own - 1.0) > 0.01:
+        yield "smoothing made the cavity more than 1 % off: choose fewer times, --smooth"
 
 
 def _surface(source: str | Path | Surface, name: str, unit: str) -> Surface:
@@ -188,7 +251,7 @@ def _surface(source: str | Path | Surface, name: str, unit: str) -> Surface:
     if surface.extent < _LEAST:
         raise InputError(
             f"{name}: it is {surface.extent:.3g} mm from corner to corner; lengths are taken as "
-            "mm: give the unit m or cm"
+            "mm: give --unit m or cm"
         )
     return surface
 
@@ -201,15 +264,19 @@ def _plane(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the normal (3,) and a point (3,) of the base plane."""
     if height is not None and point is not None:
-        raise InputError("base plane: give a height or a point, not both")
+        raise InputError(
+            "base plane: give a height or a point, not both (--base-height, --base-point)"
+        )
     has_plane = height is not None or point is not None
-    rims = [(each, one_rim(each)) for each in surfaces if each.rims or not has_plane]
+    # Openings above a plane that is given do not matter, and what is below it is cut first.
+    of_rims = [] if has_plane and axis is not None else surfaces
+    rims = [(each, one_rim(each)) for each in of_rims if each.rims or not has_plane]
     normal = np.zeros(3) if axis is None else np.asarray(axis, dtype=float)
     if axis is None:
         if len(rims) < len(surfaces):
             raise InputError(
-                "long axis: give it, from apex to base; it is found only where both surfaces are "
-                "open at the base"
+                "long axis: give it, from apex to base (--axis X Y Z); it is found only where both "
+                "surfaces are open at the base"
             )
         for each, edges in rims:
             normal += np.cross(each.points[edges[:, 0]], each.points[edges[:, 1]]).sum(axis=0)
@@ -227,7 +294,7 @@ def _plane(
     if np.ptp(levels) > _MOST_CUT * tall:
         raise InputError(
             f"base: the rims lie {np.ptp(levels):.4g} mm apart along the long axis, of {tall:.4g} "
-            "mm in all; give the base plane, or the axis"
+            "mm in all; give the base plane (--base-height or --base-point), or --axis"
         )
     flat = np.ptp(levels) < _SAME * surfaces[1].extent
     return normal, (levels.mean() if flat else levels.min()) * normal
@@ -265,16 +332,31 @@ def _thickness(endocardium: Surface, epicardium: Surface) -> Thickness:
     return Thickness(float(distances.min()), float(np.median(distances)), float(distances.max()))
 
 
+def _mesh_that_fits(
+    maps: Sequence[DiscMap], size: float, order: int, normal: np.ndarray, point: np.ndarray
+) -> tuple[float, Mesh]:
+    """Return the first of ``size`` mm and smaller ones that the wall can be meshed with."""
+    for smaller in _SMALLER:
+        try:
+            return smaller * size, _mesh(maps, smaller * size, order, normal, point)
+        except Unmeshable as error:
+            reason = error
+    raise InputError(
+        f"{reason}, nor with edges of {size:.3g} mm or any between: move the surfaces apart there, "
+        "or smooth them, --smooth 20"
+    ) from reason
+
+
 def _mesh(
     maps: Sequence[DiscMap], size: float, order: int, normal: np.ndarray, point: np.ndarray
 ) -> Mesh:
     """Return the wall between two surfaces, the inner one first, with flat rims in one plane."""
     (inner, in_disc), (outer, out_disc) = (each.remeshed(size) for each in maps)
-    within = inside(outer, inner.points, normal)
-    if not within.all():
-        raise InputError(
-            f"the wall is too thin for edges of {size:.3g} mm at "
-            f"{place_of(inner.points[~within][0])}: choose a smaller size"
+    outside = ~inside(outer, inner.points, normal)
+    within = inside(inner, outer.points, normal)
+    if (crossing := np.concatenate([inner.points[outside], outer.points[within]])).size:
+        raise Unmeshable(
+            f"the wall is too thin for edges of {size:.3g} mm at {place_of(crossing[0])}"
         )
     frame = axes_across(normal)
     # Points of a rim come first, in its order.

@@ -1,5 +1,6 @@
 """A wall between two surfaces: closed forms, whatever the surfaces' form, and what is refused."""
 
+import re
 import sys
 from dataclasses import replace
 
@@ -7,6 +8,7 @@ import meshio
 import numpy as np
 import pytest
 
+from calibrate.cli import main
 from cli_support import answer, complaint
 from emulator.core.errors import InputError
 from emulator.fem import Simulator
@@ -15,6 +17,7 @@ from emulator.geometry.facets import mean_normal
 from emulator.geometry.generators.ellipsoid import HUMAN, human_ventricle
 from emulator.geometry.io import write_mesh
 from emulator.geometry.mesh import signed_volumes
+from emulator.geometry.refinement import refined
 from emulator.geometry.surfaces import Surface, read_surface
 from emulator.geometry.two_surfaces import mesh_wall
 from emulator.scenes.draft import draft_scene
@@ -84,7 +87,7 @@ def test_open_surfaces_anywhere_tell_their_axis(open_ones):
     np.testing.assert_allclose(found.axis, TURN[:, 2], atol=1e-4)
     np.testing.assert_allclose(found.base, TURN[:, 2] * HUMAN.base + SHIFT, atol=0.1)
     assert found.cavity[1] == pytest.approx(HUMAN.cavity_volume / 1000.0, rel=0.01)
-    assert found.cut_off == 0.0
+    assert found.cut_off == (0.0, 0.0)
     assert any("more than 1 % off" in line for line in found.sentences())  # linear and coarse
 
 
@@ -97,7 +100,7 @@ def test_rims_that_are_not_flat_are_cut_at_their_lowest_point(open_ones):
     found = mesh_wall(
         inner, replace(outer, points=outer.points + saddle[:, None] * k), size=9.0, order=1
     )
-    assert found.cut_off == pytest.approx(6.0, abs=0.6)
+    assert found.cut_off[0] == pytest.approx(6.0, abs=0.6)
     assert (found.base - SHIFT) @ k == pytest.approx(HUMAN.base - 3.0, abs=0.3)
 
 
@@ -115,10 +118,50 @@ def test_fibres_by_rule_follow_the_axis_that_the_base_tells(made, tmp_path):
     assert np.quantile(between, 0.02) > 0.999
 
 
-def test_edges_too_long_for_the_curvature_are_refused(rough):
+def test_edges_too_long_for_the_curvature_are_straightened(rough):
     pytest.importorskip("gmsh", reason="no gmsh here", exc_type=(ImportError, OSError))
-    with pytest.raises(InputError, match="edges of 14 mm are too long for such curved surfaces"):
-        mesh_wall(*rough, axis=(0, 0, 1), base_height=HUMAN.base, size=14.0, smooth=5)
+    found = mesh_wall(*rough, axis=(0, 0, 1), base_height=HUMAN.base, size=14.0, smooth=5)
+    assert 0 < found.folded[0] < 0.1 * len(found.mesh.elements)
+    assert 0.0 < found.folded[1] < 14.0
+    assert any("curved elements were folded" in line for line in found.sentences())
+    discretise(refined(found.mesh).mesh)
+
+
+def test_a_sound_wall_raises_no_doubts_and_says_what_is_cut_off(made):
+    assert made.warnings == ()
+    assert made.folded == (0, 0.0)
+    height = HUMAN.long_epicardium - HUMAN.base
+    assert made.cut_off[0] == pytest.approx(height, abs=0.5)
+    whole = 4.0 / 3.0 * np.pi * HUMAN.short_epicardium**2 * HUMAN.long_epicardium / 1000.0
+    below = (HUMAN.cavity_volume + HUMAN.volume) / 1000.0
+    assert made.cut_off[1] == pytest.approx(whole - below, rel=0.02)
+
+
+def test_an_epicardium_of_both_ventricles_is_questioned(rough, tmp_path, capsys):
+    pytest.importorskip("gmsh", reason="no gmsh here", exc_type=(ImportError, OSError))
+    both = write(tmp_path / "both.stl", ellipsoid((55.0, 70.0), 8.0, (18.0, 0.0, 0.0)))
+    words = ["mesh", "--endocardium", rough[0], "--epicardium", both, "--axis", 0, 0, 1]
+    words += ["--base-height", 20, "--size", 14, "--order", 1, "--out", tmp_path / "lv.vtu"]
+    code, told = answer(capsys, *words)
+    assert code == 0
+    question = "thicker than 20 mm: a right ventricle?"
+    assert any(question in line for line in told["warnings"])
+    assert main(list(map(str, words))) == 0
+    assert question in capsys.readouterr().out
+
+
+def test_a_wall_too_thin_for_a_size_names_one_that_fits(rough):
+    pytest.importorskip("gmsh", reason="no gmsh here", exc_type=(ImportError, OSError))
+    inner = read_surface(rough[0], "endocardium")
+    outer = Surface("epicardium", 1.05 * inner.points, inner.triangles)
+    plane = {"axis": (0, 0, 1), "base_height": HUMAN.base, "order": 1}
+    with pytest.raises(InputError, match=r"too thin for edges of 20 mm: --size .* fits") as error:
+        mesh_wall(inner, outer, size=20.0, **plane)
+    size = float(re.search("--size (.*) fits", str(error.value)).group(1))
+    assert mesh_wall(inner, outer, size=size, **plane).size == size < 20.0
+    near = Surface("epicardium", 1.002 * inner.points, inner.triangles)
+    with pytest.raises(InputError, match=r"too thin for edges of 7 mm at .* or any between"):
+        mesh_wall(inner, near, size=20.0, **plane)
 
 
 @pytest.mark.slow
@@ -149,18 +192,27 @@ def with_hole(path):
     return Surface("endocardium", given.points, given.triangles[~near])
 
 
+def cut_open(path):
+    """Without its cap above the height 15 to 25 mm, which leans."""
+    given = read_surface(path, "endocardium")
+    middle = given.points[given.triangles].mean(axis=1)
+    cap = middle[:, 2] > 20.0 + 0.25 * middle[:, 0]
+    return Surface("endocardium", given.points, given.triangles[~cap])
+
+
 WRONG = {
     "swapped": (lambda a, b: ((b, a), {}), "endocardium and epicardium are swapped"),
     "crossing": (lambda a, b: ((moved(a, [15, 0, 0]), b), {}), r"the surfaces cross: \d+ of the endocardium's"),
     "apart": (lambda a, b: ((moved(a, [90, 0, 0]), b), {}), "the endocardium lies outside of the epicardium"),
     "metres": (lambda a, b: ((a, b), {"unit": "mm"}), r"endocardium: it is 0\.\d+ mm from corner to corner"),
-    "hole": (lambda a, b: ((with_hole(a), b), {}), "endocardium: it has 2 openings, the smallest of"),
+    "hole": (lambda a, b: ((with_hole(a), b), {}), r"endocardium: it has 2 openings, the smallest of .* --base-height"),
     "no plane": (lambda a, b: ((a, b), {"base_height": None}), "endocardium: it is closed; give the base plane"),
-    "no axis": (lambda a, b: ((a, b), {"axis": None}), "long axis: give it, from apex to base"),
+    "no axis": (lambda a, b: ((a, b), {"axis": None}), "long axis: give it, from apex to base .--axis X Y Z"),
     "zero axis": (lambda a, b: ((a, b), {"axis": (0, 0, 0)}), "long axis .* expected three numbers"),
     "beside": (lambda a, b: ((a, b), {"base_height": 90.0}), "endocardium: all of it is below the base"),
     "both": (lambda a, b: ((a, b), {"base_point": (0, 0, 0)}), "give a height or a point, not both"),
-    "size": (lambda a, b: ((a, b), {"size": -1.0}), "size -1.0 mm: expected edges above 0"),
+    "opening": (lambda a, b: ((cut_open(a), b), {}), "its opening reaches below the base plane, down to 14.* mm along the axis"),
+    "size": (lambda a, b: ((a, b), {"size": -1.0}), "--size -1.0 mm: expected edges above 0"),
     "order": (lambda a, b: ((a, b), {"order": 3}), "order 3: expected 1 or 2"),
     "smooth": (lambda a, b: ((a, b), {"smooth": -1}), "smooth -1: expected 0 times or more"),
     "unit": (lambda a, b: ((a, b), {"unit": "inch"}), "unit 'inch' is unknown; known: mm, cm, m"),

@@ -65,7 +65,12 @@ _PLACE = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
     option("--endocardium", "FILE", "triangles", required=True),
     option("--epicardium", "FILE", "triangles", required=True),
     option("--out", "FILE.vtu", "mesh to write, in mm", required=True),
-    option("--size", "MM", "edges (default: 0.7 of the median thickness)", type=float),
+    option(
+        "--size",
+        "MM",
+        "edges (default: 0.7 of the median thickness, or less in a thin wall)",
+        type=float,
+    ),
     option(
         "--order", type=int, default=2, choices=(1, 2), help="of the elements (default: 2, curved)"
     ),
@@ -114,8 +119,10 @@ def mesh(arguments: Namespace) -> Answer:
         "base": wall.base,
         "thickness": wall.thickness._asdict(),
         **pairs,
-        "cut_off": wall.cut_off,
+        **dict(zip(("cut_off", "cut_off_ml"), wall.cut_off, strict=True)),
         "moved": wall.moved,
+        "folded": wall.folded[0],
+        "warnings": list(wall.warnings),
         "quality": wall.quality._asdict(),
     }
     lines = [*wall.sentences(), f"written to {out}, then: calibrate init {out}"]
@@ -126,6 +133,7 @@ def mesh(arguments: Namespace) -> Answer:
         title = f"{Path(out).stem}: {result['nodes']} nodes"
         figure = surface_figure(wall.mesh, wall.local_thickness(), title, "wall thickness (mm)")
         save(figure, picture)
+        result["picture"] = picture
         lines.append(f"picture: {picture}")
     return Answer(result, "\n".join(lines))
 
