@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calibrate.cli import main
-from cli_support import answer
+from cli_support import answer, complaint
 
 
 @pytest.mark.slow
@@ -97,3 +97,50 @@ def test_a_corner_of_a_guessed_box_is_no_knowledge(cases, tmp_path, capsys):
     )
     assert code == 0
     assert not any("the box" in sentence for sentence in told["warnings"])
+
+
+def wall_between(cases, endocardium, epicardium, axis, height, out, *more):
+    """The words of ``calibrate mesh``; the test is skipped without Gmsh."""
+    pytest.importorskip("gmsh", reason="no gmsh here", exc_type=(ImportError, OSError))
+    surfaces = "--endocardium", cases / endocardium, "--epicardium", cases / epicardium
+    return "mesh", *surfaces, "--axis", 0, 0, axis, "--base-height", height, "--out", out, *more
+
+
+@pytest.mark.parametrize("size", [0.7, 1.15, 1.4, 2.0])
+def test_rough_surfaces_are_meshed_at_every_size(cases, tmp_path, capsys, size):
+    folder, out = "coarse_rough_surfaces", tmp_path / "lv.vtu"
+    files = f"{folder}/endo.stl", f"{folder}/epi.stl"
+    code, told = answer(capsys, *wall_between(cases, *files, 1, 1.5, out, "--size", size))
+    assert code == 0
+    assert 0 < told["folded"] < 0.2 * told["elements"]
+    assert told["quality"]["jacobian"] > 0.3
+    assert told["cavity"]["mesh"] == pytest.approx(told["cavity"]["surface"], rel=0.01 * size**3)
+
+
+def test_openings_above_the_base_plane_do_not_count(cases, tmp_path, capsys):
+    cavities = []
+    for name in ("endo", "endo_closed"):
+        files = f"two_valves/{name}.stl", "two_valves/epi.stl"
+        words = wall_between(cases, *files, 1, 8, tmp_path / f"{name}.vtu")
+        code, told = answer(capsys, *words)
+        assert code == 0
+        assert told["warnings"] == []
+        cavities.append(told["cavity"])
+    assert cavities[0] == pytest.approx(cavities[1], rel=1e-9)
+    assert cavities[0]["surface"] == pytest.approx(52.6, rel=0.01)  # closed form, mL
+    words = wall_between(cases, *files, 1, 80, tmp_path / "beside.vtu")
+    assert "--base-height between -40 and 40 mm" in complaint(capsys, *words)
+
+
+def test_an_axis_the_wrong_way_round_is_questioned(cases, tmp_path, capsys):
+    files = "two_valves/endo_closed.stl", "two_valves/epi.stl"
+    words = wall_between(cases, *files, -1, -8, tmp_path / "cap.vtu")
+    code, told = answer(capsys, *words)
+    assert code == 0
+    assert told["cut_off"] == pytest.approx(58.0, abs=0.1)
+    assert told["cut_off_ml"] == pytest.approx(131.7, rel=0.01)
+    doubt = told["warnings"][0]
+    assert "the base plane cuts off 131.7 mL and leaves 80.9" in doubt
+    assert "--axis 0 0 1 --base-height 8" in doubt
+    assert main(list(map(str, words))) == 0
+    assert doubt in capsys.readouterr().out

@@ -150,6 +150,7 @@ def test_an_epicardium_of_both_ventricles_is_questioned(rough, tmp_path, capsys)
     assert question in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_wall_too_thin_for_a_size_names_one_that_fits(rough):
     pytest.importorskip("gmsh", reason="no gmsh here", exc_type=(ImportError, OSError))
     inner = read_surface(rough[0], "endocardium")
