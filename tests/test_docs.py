@@ -118,7 +118,13 @@ def public_names(code):
             yield from (alias.name for alias in node.names)
 
 
-@pytest.mark.parametrize("page", PAGES)
+# Pages with more than ten seconds of examples: compilation, nearly all.
+LONG = ("docs/analyses.md", "docs/observations.md", "docs/populations.md", "docs/quickstart.md")
+
+
+@pytest.mark.parametrize(
+    "page", [pytest.param(p, marks=pytest.mark.slow if p in LONG else ()) for p in PAGES]
+)
 def test_the_quick_examples_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "Agg")

@@ -54,6 +54,7 @@ def ask(address, what, position, **headers):
         return answer.read()
 
 
+@pytest.mark.slow
 def test_displacement_and_volume_are_the_emulators(emulator, explorer, address):
     position = {**CENTRE, "pressure": "0.8"}
     found = np.frombuffer(ask(address, "at", position), "<f4")

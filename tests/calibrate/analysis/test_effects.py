@@ -42,6 +42,7 @@ def loose(pulled, corners):
         return recommend(pulled, corners, 2.0, samples=2)
 
 
+@pytest.mark.slow
 def test_changes_are_those_of_fem(pulled, corners, loose):
     alone = {each.left_out: each for each in loose.alone}
     assert set(alone) == {("finite strain",), ("gravity",)}
@@ -117,6 +118,7 @@ def test_a_scene_that_fem_does_not_solve(pulled, corners):
         recommend(heavy, corners, 1.0, samples=2)
 
 
+@pytest.mark.slow
 def test_command(capsys):
     words = ["effects", "once_clamped_beam", "--observe", "landmarks:4", "--samples", "2"]
     assert main([*words, "--tolerance", "1mm", "--json"]) == 0

@@ -85,6 +85,7 @@ def test_modes_follow_the_mean_of_each_set():
     np.testing.assert_allclose(list(found.values()), wanted, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_sds_are_those_of_posteriors_of_data_with_a_gain():
     """Posteriors on a grid: the factor of simulated data integrated, C + 0.1^2 g g^T at each theta."""
     found = expected_precision(displacements(BOTH), systematic={"gain": GAIN}, data_sets=128)["sd"]

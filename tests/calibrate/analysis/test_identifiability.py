@@ -66,6 +66,7 @@ def test_expected_precision_is_the_closed_form(case, forward):
     np.testing.assert_allclose(list(found["sd"].values()), wanted, rtol=0.05)
 
 
+@pytest.mark.slow
 def test_posteriors_are_averaged_in_the_box_of_the_prior(beam, forward):
     """Data that sees mu + lam alone, by sums over a grid: a box ends where a Gaussian does not."""
     alike = forward.matrix.copy()

@@ -30,6 +30,7 @@ def tip(forward: ForwardMap):
     return parse_observation(forward.scene, "nodes:4", 0)
 
 
+@pytest.mark.slow
 def test_emulator_and_fem_agree_on_one_design(forward: ForwardMap) -> None:
     by_emulator = cal.sensitivity(forward, tip(forward), samples=8)
     by_fem = cal.sensitivity(fem_forward(em.Simulator(forward.scene)), tip(forward), samples=8)

@@ -43,6 +43,7 @@ def slowly(*values):
     return [pytest.param(value, marks=pytest.mark.slow) for value in values]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [-1.0, *slowly(0.0, 0.2, 5.0)])
 def test_gradients_that_are_not_the_map_s(beam, fem, factor):
     """Acceptance knows the values: draws are slow, or right, or the certificate sees it."""

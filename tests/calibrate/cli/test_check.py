@@ -17,6 +17,7 @@ def test_what_the_prior_predicts(tmp_path, capsys):
     assert (tmp_path / "prior_predictive.safetensors").is_file()
 
 
+@pytest.mark.slow
 def test_what_data_would_determine(capsys):
     """The beam bends by mu and hardly by lam, which its prior knows as well as the data does."""
     assert main(["identify", "before", *BEAM, "--json"]) == 0

@@ -1,10 +1,13 @@
 """``calibrate check mesh``."""
 
+import pytest
+
 import emulator as em
 from calibrate.cli import main
 from emulator.geometry.io import write_mesh
 
 
+@pytest.mark.slow
 def test_from_the_command_line(capsys, tmp_path):
     (tmp_path / "beam.toml").write_text(BEAM)
     write_mesh(tmp_path / "beam.vtu", em.scenes.once_clamped_beam((4, 1, 1)).mesh)

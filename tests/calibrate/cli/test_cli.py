@@ -137,6 +137,7 @@ def test_train_and_evaluate(capsys, block, tmp_path):
     assert errors["err_u"]["median"] < 0.1 * errors["max_u"]["median"]
 
 
+@pytest.mark.slow
 def test_infer_and_certify(capsys, block, tmp_path):
     """A scene of the user's own, and a forward map made of FEM runs, which needs no training."""
     words = ["--truth", "mu=9", "--observe", "landmarks:6", "--noise", "0.02"]

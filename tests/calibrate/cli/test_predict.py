@@ -33,6 +33,7 @@ def test_inside_the_box(capsys, tmp_path):
     np.testing.assert_allclose(meshio.read(out).point_data["displacement"], u)
 
 
+@pytest.mark.slow
 def test_error_bar_against_fem(capsys):
     trained = em.load("once_clamped_beam")
     theta = trained.scene.theta(mu=75.0, lam=60.0)

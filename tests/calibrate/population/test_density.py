@@ -43,6 +43,7 @@ def points(density):
     return jax.random.normal(jax.random.key(3), (4, density.dimension))
 
 
+@pytest.mark.slow
 def test_coordinates_do_not_change_the_density(model):
     """p(w) = p(w') |det dw'/dw|, with w' the coordinates of members whose data say nothing."""
     density = density_of_population(model)

@@ -55,6 +55,7 @@ def close(values, mean, sd, ess):
     assert abs(values.std() - sd) < 4.0 * error
 
 
+@pytest.mark.slow
 def test_the_mean_of_linear_gaussian_members_is_normal(beam):
     """m | y is normal: precision n / (s^2 + d^2) + 1 / 10^2, with the sd d of one member's data."""
     wide = (Parameter("mu", "kPa", 1.0, 160.0), Parameter("lam", "kPa", 1.0, 160.0))

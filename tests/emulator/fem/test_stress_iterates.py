@@ -254,6 +254,7 @@ def test_with_mean_dilatation_they_end_where_newton_does(dilated):
     assert int(ramps.iterations) <= 0.6 * int(volumes.iterations)  # 10 and 22
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_body_that_is_pulled_by_its_face_climbs_the_ramps(order):
     """Prescribed displacements: fewer than Newton's iterations, the same end."""

@@ -79,6 +79,7 @@ def test_a_flat_disc_is_laid_out_as_it_is():
     np.testing.assert_allclose(*between, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_no_triangle_of_a_cap_turns_over(ball):
     cap = cut(ball, 5.0 * UP, UP)
     flat = DiscMap(cap)

@@ -49,6 +49,7 @@ def test_angles_turn_fibres_to_where_the_rule_lays_them(turning, fixed):
     assert one == pytest.approx(float(other), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_equilibria_and_their_derivatives(turning, fixed):
     simulator = em.fem.Simulator(turning)
     theta = turning.theta(**KNOWN, inner=63.0, outer=-51.0)

@@ -128,6 +128,7 @@ def test_a_budget_leaves_time_for_the_branch():
     assert PLAN.budget_share < replace(PLAN, polish=0).budget_share <= 1.0
 
 
+@pytest.mark.slow
 def test_coefficients_are_of_values_and_slopes(modal, problem):
     """A branch that gives the coefficients gives displacements and their slopes in theta."""
     scene, runs = modal.scene, problem.runs

@@ -35,6 +35,7 @@ def fine(body, coarse, tmp_path_factory):
     return train(body.scene, PLAN, tmp_path_factory.mktemp("fine"), start=coarse)
 
 
+@pytest.mark.slow
 def test_a_few_runs_take_it_to_the_finer_mesh(body, fine):
     simulator, cached = em.Simulator(body.scene), fine.cache()
     without = replace(fine, discrepancy=None).cache()
@@ -44,6 +45,7 @@ def test_a_few_runs_take_it_to_the_finer_mesh(body, fine):
         assert jnp.linalg.norm(cached(theta) - exact) < 0.01 * size
 
 
+@pytest.mark.slow
 def test_the_coarse_part_is_the_same_function_of_place(body, coarse, fine):
     theta = body.scene.from_unit(jnp.array([0.2, 0.7]))
     below = body.refinement.carry(np.asarray(coarse.cache()(theta)))
@@ -56,6 +58,7 @@ def test_the_coarse_part_is_the_same_function_of_place(body, coarse, fine):
     np.testing.assert_allclose(at, below[some], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_it_is_kept_and_found_again(body, fine, tmp_path):
     save_emulator(fine, tmp_path)
     again = load(tmp_path)
