@@ -23,8 +23,10 @@ LABELS = {
     "err_u": "error in displacement (mm)",
     "err_F": "error in deformation gradient",
     "err_I1": "error in first invariant",
+    "err_E": "largest error in strain",
     "err_Pi": "error in energy (%)",
     "err_V": "error in cavity volume (%)",
+    "err_R": "error in force of support (N)",
 }
 _INSIDE, _OUTSIDE = "tab:blue", "tab:orange"
 

@@ -167,14 +167,9 @@ def with_data(problem: Problem) -> Problem:
         name: np.asarray(exact[name]) + noises[name].simulate(rng, part.shape)
         for name, part in observe.parts.items()
     }
-    for name, part in observe.parts.items():
-        try:
+    with naming("synthetic, of too much noise (--noise)"):
+        for name, part in observe.parts.items():
             part.check(name, data[name])
-        except InputError as error:
-            raise InputError(
-                f"synthetic {error} (without noise {np.min(exact[name]):.3g}): its noise is too "
-                f"large, give a smaller --noise {split(name)[0]}=SD"
-            ) from error
     return replace(problem, data=data)
 
 

@@ -13,7 +13,9 @@ from scipy.stats import gaussian_kde
 
 from emulator.core.errors import InputError, SolverError
 from emulator.fem.energy import displacement_gradient, potential_energy
+from emulator.fem.reactions import SupportForce, support_forces
 from emulator.geometry.facets import Cavity
+from emulator.scenes.loads.force import MN_PER_N
 from emulator.scenes.scene import Scene, cavity_sets
 from emulator.surrogates.protocol import ForwardMap
 
@@ -21,10 +23,13 @@ UNITS = {
     "err_u": "mm",
     "err_F": "1",
     "err_I1": "1",
+    "err_E": "1",
     "err_Pi": "%",
     "err_V": "%",
+    "err_R": "N",
     "max_u": "mm",
     "mean_u": "mm",
+    "max_R": "N",
 }
 _VALUES = 20_000  # from which a density is estimated; more do not change the curve visibly
 
@@ -59,15 +64,19 @@ def field_errors(
     u: jax.Array,
     reference: jax.Array,
     cavities: Sequence[Cavity] = (),
+    supports: Sequence[SupportForce] = (),
 ) -> dict[str, jax.Array]:
     """Return the errors of one field ``u`` (n, 3) against ``reference`` (n, 3).
 
     err_u : the distance (n,) in mm at each node.
     err_F : the Frobenius norm (m, q) of the error in the deformation gradient.
     err_I1 : the error (m, q) in the first invariant.
+    err_E : the largest error (m, q) among the components of the Green-Lagrange strain.
     err_Pi : the error () in the potential energy, percent; absent where the mesh is the loaded
         (``Scene.loaded_by``), since the energy needs displacements from rest.
     err_V : the error (v,) in the volume of each of the ``cavities``, percent; absent without any.
+    err_R, max_R : the error (r,) in the force of each of the ``supports``, and the largest force ()
+        of the reference, N; absent without any.
     """
     H, H_reference = displacement_gradient(scene, u), displacement_gradient(scene, reference)
     I1, I1_reference = (
@@ -77,6 +86,7 @@ def field_errors(
         "err_u": jnp.sqrt(jnp.sum((u - reference) ** 2, axis=-1)),
         "err_F": jnp.sqrt(jnp.sum((H - H_reference) ** 2, axis=(-2, -1))),
         "err_I1": jnp.abs(I1 - I1_reference),
+        "err_E": jnp.max(jnp.abs(_strain(H) - _strain(H_reference)), axis=(-2, -1)),
     }
     if not scene.loaded_by:
         Pi = potential_energy(scene)
@@ -84,7 +94,17 @@ def field_errors(
     if cavities:
         volumes = [_percent(V(u[V.nodes]), V(reference[V.nodes])) for V in cavities]
         errors["err_V"] = jnp.stack(volumes)
+    if supports:
+        each = [[R(v[R.nodes], theta) / MN_PER_N for v in (u, reference)] for R in supports]
+        force, exact = jnp.array(each).T
+        errors |= {"err_R": jnp.abs(force - exact), "max_R": jnp.max(jnp.abs(exact))}
     return errors
+
+
+def _strain(H: jax.Array) -> jax.Array:
+    """Return the Green-Lagrange strain (..., 3, 3)."""
+    transposed = jnp.swapaxes(H, -1, -2)
+    return 0.5 * (H + transposed + transposed @ H)
 
 
 def _percent(value: jax.Array, exact: jax.Array) -> jax.Array:
@@ -122,11 +142,13 @@ def case_errors(forward: ForwardMap, thetas: jax.Array, reference: jax.Array) ->
     if len(forward.nodes) != len(scene.mesh.nodes):
         raise InputError("evaluation needs a forward map over all nodes")
     cavities = [Cavity(scene.mesh, name) for name in cavity_sets(scene)]
+    # The forces of a mesh that is the loaded one need displacements from rest, too.
+    supports = () if scene.loaded_by else tuple(support_forces(scene).values())
 
     @jax.jit
     def one(theta: jax.Array, exact: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
         prediction = forward.evaluate(theta)
-        errors = field_errors(scene, theta, prediction.displacement, exact, cavities)
+        errors = field_errors(scene, theta, prediction.displacement, exact, cavities, supports)
         size = jnp.sqrt(jnp.sum(exact**2, axis=-1))
         errors |= {"max_u": jnp.max(size), "mean_u": jnp.mean(size)}
         finite = jnp.array([jnp.all(jnp.isfinite(value)) for value in errors.values()])
@@ -154,8 +176,9 @@ def evaluate(forward: ForwardMap, thetas: jax.Array, reference: jax.Array) -> di
 
     Returns
     -------
-    dict with err_u, err_F, err_I1, err_Pi (of a body at rest) and, where the scene has a cavity,
-    err_V (quantiles; over nodes, points or cavities and cases together), max_u and mean_u (of |u|
-    over the nodes of each case), units, cases (valid ones), and invalid, the number of the others.
+    dict with err_u, err_F, err_I1, err_E, err_Pi (of a body at rest) and, where the scene has
+    cavities or supports that prescribe displacements, err_V or err_R and max_R (quantiles; over
+    nodes, points, cavities or supports and cases together), max_u and mean_u (of |u| over the nodes
+    of each case), units, cases (valid ones), and invalid, the number of the others.
     """
     return case_errors(forward, thetas, reference).report()

@@ -203,6 +203,16 @@ class SupportForce:
         return bulk - jnp.vdot(external, prescribed) + jnp.vdot(force_of(springs), sprung)
 
 
+def support_forces(scene: Scene) -> dict[str, SupportForce]:
+    """Return the force of each support along each axis that it holds, by ``SUPPORT:AXIS``."""
+    held = [each for support in scene.supports if (each := support.held(scene.mesh)) is not None]
+    return {
+        f"{each.where}:{'xyz'[k]}": SupportForce(scene, each.where, tuple(np.eye(3)[k].tolist()))
+        for each in held
+        for k in each.axes
+    }
+
+
 def _contributions_at[T: (LocalTerm, LocalForce, LocalTerm | LocalForce)](
     parts: Sequence[T], virtual: np.ndarray
 ) -> list[T]:

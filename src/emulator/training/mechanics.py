@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.accuracy.comparison import evaluate
 from emulator.core.errors import InputError
 from emulator.fem import Simulator
 from emulator.fem.campaign import Runs
@@ -137,17 +138,21 @@ def add_discrepancy(
 
     sums = _sums(emulator, series)
     errors: dict[str, float] = {}
+    trials: dict[str, Emulator] = {}
+    held_out: dict[str, Any] = {}
     best = next((n for n in ("coarse", "taylor") if n in sums), "nothing")
     if count >= FEWEST:
         test = np.arange(count) % _HELD_OUT == _HELD_OUT - 1
         for name, bare in sums.items():
-            errors[name] = _error(fitted(bare, runs.take(~test)), runs.take(test))
+            trials[name] = fitted(bare, runs.take(~test))
+            errors[name] = _error(trials[name], runs.take(test))
         best = min(errors, key=errors.__getitem__)
+        held_out = evaluate(trials[best].cache(), *runs.take(test)[:2])
     final_model = fitted(sums[best], runs)
     assert final_model.discrepancy is not None, "it was fitted above"
     modes = len(final_model.discrepancy.modes)
     record = {"on": best, "runs": count, "modes": modes, "held_out_err_u_mm": errors}
-    return final_model, record
+    return final_model, record | ({"held_out": held_out} if held_out else {})
 
 
 def _sums(emulator: Emulator, series: Expansion) -> dict[str, Emulator]:

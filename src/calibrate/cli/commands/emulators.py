@@ -67,7 +67,7 @@ def predict(arguments: Namespace) -> Answer:
         "max_displacement": float(np.linalg.norm(u, axis=1).max()) if finite else None,
         "least_J": float(against.least_J) if finite else None,
         "volumes": volumes(scene, u, estimate) if finite else {},
-        "error": None if estimate is None else _error_of(estimate),
+        "error": None if estimate is None else _error_of(estimate, scene, theta),
     }
     if arguments.out and finite and against.least_J > 0.0:
         write_solution(arguments.out, scene.mesh, np.asarray(u), element_fields(scene, u, theta))
@@ -91,10 +91,16 @@ def _anywhere(scene: Scene, values: dict[str, float]) -> jax.Array:
     return jnp.array([values[name] for name in scene.parameter_names])
 
 
-def _error_of(estimate: ErrorEstimate) -> dict[str, Any]:
+def _error_of(estimate: ErrorEstimate, scene: Scene, theta: jax.Array) -> dict[str, Any]:
     """Return the error bar as plain JSON; without numbers where it is not valid."""
+    from emulator.accuracy.comparison import field_errors
+    from emulator.fem.reactions import support_forces
+
     if not estimate.valid:
         return {"valid": False}
+    supports = {} if scene.loaded_by else support_forces(scene)
+    u, closer = estimate.displacement, estimate.displacement - estimate.field
+    errors = field_errors(scene, theta, u, closer, supports=tuple(supports.values()))
     gap, least = float(estimate.energy_gap), float(estimate.least_energy)
     return {
         "valid": True,
@@ -103,6 +109,8 @@ def _error_of(estimate: ErrorEstimate) -> dict[str, Any]:
         "max_mm": float(estimate.max),
         "energy_gap": gap,
         "energy_gap_percent": 100.0 * gap / abs(least) if least else None,
+        "strain": float(errors["err_E"].max()),
+        "reactions_n": dict(zip(supports, map(float, errors.get("err_R", ())), strict=True)),
         "contraction": float(estimate.contraction),
         "iterations": int(estimate.iterations),
     }
@@ -125,8 +133,9 @@ def prediction_summary(result: dict[str, Any]) -> str:
         gap = "" if percent is None else f"; energy gap {percent:.2g} %"
         lines.append(
             f"estimated error: median {error['median_mm']:.2g} mm, "
-            f"largest {error['max_mm']:.2g} mm{gap}"
+            f"largest {error['max_mm']:.2g} mm, {error['strain']:.2g} in strain{gap}"
         )
+        lines += [f"force of '{n}': error {e:.2g} N" for n, e in error["reactions_n"].items()]
     if not result["trusted"]:
         lines.append(f"not to be trusted: {result['guard']}")
     return "\n".join(lines)

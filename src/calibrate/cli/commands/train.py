@@ -136,10 +136,17 @@ def _training_summary(folder: str, scene: str, record: Mapping[str, Any]) -> str
     error = choice.get("held_out_err_u_mm", {}).get(choice.get("on"))
     if "sweeps" in record and "steps" not in plan:
         usual, most = (record["sweeps"][name] for name in ("error_mm", "largest_error_mm"))
-        return f"{text}; {usual:.1g} mm from equilibrium, {most:.1g} mm at the worst theta tried"
+        text += f"; {usual:.1g} mm from equilibrium, {most:.1g} mm at the worst theta tried"
     if error is None:
-        return f"{text}; its error: calibrate evaluate {folder}"
-    return f"{text}; {error:.2g} mm from FEM at held-out runs"
+        return f"{text}; errors of forces, volumes and strains: calibrate evaluate {folder}"
+    text += f"; {error:.2g} mm from FEM at held-out runs"
+    observed = {"err_R": "force of a support", "err_V": "cavity volume", "err_E": "strain"}
+    found = choice.get("held_out", {})
+    worst = [f"{found[name]['max']:.2g} {found['units'][name]} in {what}".replace(" 1 in", " in")
+             for name, what in observed.items() if name in found]  # fmt: skip
+    if "max_R" in found and worst:
+        worst[0] += f" (the largest is {found['max_R']['max']:.2g} N)"
+    return f"{text}, at worst {', '.join(worst)}" if worst else text
 
 
 def _plan_entries(arguments: Namespace) -> dict[str, Any]:
