@@ -144,3 +144,29 @@ def test_an_axis_the_wrong_way_round_is_questioned(cases, tmp_path, capsys):
     assert "--axis 0 0 1 --base-height 8" in doubt
     assert main(list(map(str, words))) == 0
     assert doubt in capsys.readouterr().out
+
+
+def test_forces_of_an_emulator_that_is_right_in_displacement(cases, tmp_path, capsys):
+    """Training, evaluation, inference and certificate name the map: 1.36 +- 0.23 for 1."""
+    case, out = cases / "uniaxial_reaction", tmp_path / "post"
+    emulator = str(tmp_path / "emulator")
+    assert main(["train", str(case / "ho.toml"), "--recipe", "mechanics", "--out", emulator]) == 0
+    assert "at worst 1.4 N in force of a support (the largest is 1.7 N)" in capsys.readouterr().out
+    _, errors = answer(capsys, "evaluate", emulator, "--against", "fem", "--cases", "10")
+    assert errors["err_u"]["max"] < 0.1 < errors["err_R"]["max"]
+    assert errors["units"]["err_R"] == "N"
+    words = ["infer", case / "ho.toml", "--data", case / "force.csv", "--noise", "0.02"]
+    words += ["--emulator", emulator, "--draws", "200", "--out", out]
+    code, told = answer(capsys, *words, "--warmup", "200", "--chains", "2")
+    assert code == 1
+    assert told["warnings"][0].startswith("the forward map misses FEM by ")
+    assert "--forward corrected" in told["warnings"][0]
+    assert "for which sampler" not in " ".join(told["warnings"])
+    first, *rest = told["certificate"]["findings"]
+    assert told["verdict"] == "not certified"
+    assert first.startswith("the forward map misses FEM by ")
+    assert not any("their modes" in finding for finding in rest)
+    words += ["--force", "--no-certify", "--forward", "corrected", "--sampler", "laplace"]
+    code, told = answer(capsys, *words)
+    assert (code, told["warnings"]) == (0, [])
+    assert told["parameters"]["a"]["mean"] == pytest.approx(1.0, abs=0.05)
