@@ -11,8 +11,7 @@ import pytest
 import emulator as em
 from emulator.mechanics.kinematics import Strain
 from emulator.mechanics.laws import find_law
-from emulator.mechanics.laws.law import Law, modulus
-from emulator.mechanics.laws.volumetric import logarithmic, quadratic
+from emulator.mechanics.laws.law import Law, logarithmic, modulus, quadratic
 from emulator.scenes.loads import CavityPressure, Gravity, Traction
 from scene_support import block
 

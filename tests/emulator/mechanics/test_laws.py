@@ -8,8 +8,8 @@ from emulator.core.errors import InputError
 from emulator.mechanics.kinematics import Barriers, Strain
 from emulator.mechanics.laws import LAWS, find_law
 from emulator.mechanics.laws.holzapfel_ogden import textbook_from_released
+from emulator.mechanics.laws.law import logarithmic, quadratic, quadratic_logarithmic
 from emulator.mechanics.laws.neo_hookean import lame_from_engineering
-from emulator.mechanics.laws.volumetric import logarithmic, quadratic, quadratic_logarithmic
 from law_support import ARGUMENTS, FIBRE, LAM, MU, SHEET
 from scene_support import rotation, slope
 

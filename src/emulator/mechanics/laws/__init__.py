@@ -12,8 +12,15 @@ from importlib import import_module
 
 from emulator.core.errors import look_up
 from emulator.mechanics.kinematics import Strain
-from emulator.mechanics.laws.law import Law, Quantity, modulus, number
-from emulator.mechanics.laws.volumetric import logarithmic, quadratic, quadratic_logarithmic
+from emulator.mechanics.laws.law import (
+    Law,
+    Quantity,
+    logarithmic,
+    modulus,
+    number,
+    quadratic,
+    quadratic_logarithmic,
+)
 
 LAWS: dict[str, Law] = {
     law.name: law

@@ -18,8 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from emulator.mechanics.kinematics import Strain
-from emulator.mechanics.laws.law import Law, modulus, number
-from emulator.mechanics.laws.volumetric import quadratic
+from emulator.mechanics.laws.law import Law, modulus, number, quadratic
 
 
 def energy(

@@ -11,7 +11,7 @@ resist stretch only, :math:`\langle x \rangle = \max(x, 0)`:
 Two effects can be left out: the switch, so that fibres resist being shortened as they do being
 stretched, and the fibres. The released variant behind the paper's published solutions has no
 factors 1/2 and no switch; its ``a`` and ``a_f`` are half the textbook's. All have the volumetric
-part ``quadratic_logarithmic`` (:mod:`~emulator.mechanics.laws.volumetric`) with the parameter
+part ``quadratic_logarithmic`` (:mod:`~emulator.mechanics.laws.law`) with the parameter
 kappa.
 """
 
@@ -23,8 +23,7 @@ import jax
 import jax.numpy as jnp
 
 from emulator.mechanics.kinematics import Strain
-from emulator.mechanics.laws.law import Law, modulus, number
-from emulator.mechanics.laws.volumetric import quadratic_logarithmic
+from emulator.mechanics.laws.law import Law, modulus, number, quadratic_logarithmic
 
 
 def energy(

@@ -1,4 +1,4 @@
-r"""The interface of a hyperelastic law: a name, parameters with units, an energy; its identity.
+r"""The interface of a hyperelastic law, its identity, and energies of volume change.
 
 A law's code can change while its name stays. The identity of a law therefore includes the values
 
@@ -6,6 +6,16 @@ A law's code can change while its name stays. The identity of a law therefore in
 
 of its energy at fixed displacement gradients that stretch, squeeze and shear the fibres, with fixed
 parameters; the values are rounded to eight digits, so that processors and releases of JAX agree.
+
+Nearly incompressible laws share energies of volume change:
+
+==================  =============================================
+quadratic           :math:`\frac{\kappa}{2} (J - 1)^2`
+quadratic_logarithmic  :math:`\kappa (J^2 - 1 - 2 \ln J)`
+logarithmic         :math:`\frac{\kappa}{2} (\ln J)^2`
+==================  =============================================
+
+Near :math:`J = 1` the second is :math:`2 \kappa (J - 1)^2`, four times as stiff as the others.
 """
 
 from __future__ import annotations
@@ -163,3 +173,23 @@ def _value(quantity: Quantity, position: np.ndarray) -> np.ndarray:
     low = quantity.low if np.isfinite(quantity.low) else -1.0
     high = quantity.high if np.isfinite(quantity.high) else low + 4.0
     return low + (high - low) * (0.1 + 0.8 * position)
+
+
+Volumetric = Callable[[Strain, jax.Array], jax.Array]
+
+
+def quadratic(strain: Strain, kappa: jax.Array) -> jax.Array:
+    """Return ``kappa/2 (J-1)^2`` in the unit of ``kappa``; finite even for an inverted point."""
+    return 0.5 * kappa * strain.J_minus_1**2
+
+
+def quadratic_logarithmic(strain: Strain, kappa: jax.Array) -> jax.Array:
+    """Return ``kappa (J^2 - 1 - 2 ln J)`` in the unit of ``kappa``."""
+    change = strain.J_minus_1
+    # J^2 - 1 - 2 ln J = (J-1)^2 + 2 [(J-1) - ln J], without cancellation near J = 1.
+    return kappa * (change**2 + 2.0 * (change - jnp.log1p(change)))
+
+
+def logarithmic(strain: Strain, kappa: jax.Array) -> jax.Array:
+    """Return ``kappa/2 (ln J)^2`` in the unit of ``kappa``."""
+    return 0.5 * kappa * strain.ln_J**2

@@ -27,8 +27,7 @@ import jax
 import jax.numpy as jnp
 
 from emulator.mechanics.kinematics import Strain
-from emulator.mechanics.laws.law import Law, modulus, number
-from emulator.mechanics.laws.volumetric import quadratic_logarithmic
+from emulator.mechanics.laws.law import Law, modulus, number, quadratic_logarithmic
 
 
 def energy_lame(strain: Strain, mu: jax.Array, lam: jax.Array) -> jax.Array:
