@@ -95,8 +95,10 @@ for _module in (_gmsh40, _gmsh41):
 def _read_gmsh(path: Path) -> meshio.Mesh:
     """Return a Gmsh file. In format 2, ``Mesh.SaveAll = 1`` leaves only the names of groups."""
     content = _read(path)
-    tags = content.cell_data.get("gmsh:physical", [])
-    if content.field_data and not any(np.any(each) for each in tags):
+    tags = [np.abs(each) for each in content.cell_data.get("gmsh:physical", [])]
+    if tags:
+        content.cell_data["gmsh:physical"] = tags
+    if content.field_data and not any(each.any() for each in tags):
         names = ", ".join(content.field_data)
         content.info = [f"groups {names}, which are empty (save them with Mesh.SaveAll = 0)"]
     return content
@@ -200,6 +202,8 @@ def _read_abaqus(path: Path) -> meshio.Mesh:
             members = [str(k) for a, b, *by in steps for k in range(a, b + 1, *by)]
         else:
             members = [word for row in rows for word in row if word]
+            if not members and kind in sets:  # such as the nodes of an element set
+                info[f"set {name}, which has no members of its own"] = None
         if kind in sets and name:
             sets[kind].setdefault(name.upper(), []).extend(members)
             names.setdefault(name.upper(), name)
