@@ -137,6 +137,11 @@ def _tables(file: DataTable) -> dict[str, tuple[type[Observation], Table]]:
     raise InputError(f"data file {file.path}: {fault}; expected {file.what}s {every}")
 
 
+def _by_value(name: str) -> list[str | float]:
+    """Return the words of a name, numbers by value: ``klotz:1.30`` is ``klotz:1.3``."""
+    return [float(w) if w.replace(".", "", 1).isdecimal() else w for w in name.split(":")]
+
+
 def write_data(
     path: str | Path,
     observe: Observation | Observations,
@@ -151,7 +156,7 @@ def write_data(
     states: dict[str, list[Block]] = {state: [] for state in observe.states}
     for name, part in observe.parts.items():
         base, state = split(name)
-        if base not in part.names:
+        if _by_value(base) not in map(_by_value, part.names):
             raise InputError(
                 f"observation '{name}' does not fit in a data file; "
                 f"there it would be called {' or '.join(part.names)}"

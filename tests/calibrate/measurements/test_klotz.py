@@ -7,8 +7,8 @@ import pytest
 from scipy.optimize import brentq
 
 import calibrate as cal
-from calibrate.measurements import observations_from_json, parse_observation
-from calibrate.measurements.data import read_measurements
+from calibrate.measurements import observations, observations_from_json, parse_observation
+from calibrate.measurements.data import read_measurements, write_data
 from calibrate.project import Run
 from calibrate.samplers.laplace import LaplaceOptions
 from emulator.core.errors import InputError
@@ -73,6 +73,19 @@ def test_an_observation_is_the_point_whose_curve_passes_through_the_body(ventric
     moved = [float(observe(u, theta.at[-1].set(0.7 + h))) for h in (-1e-5, 1e-5)]
     klotz = cal.Klotz(found, pressure)
     assert float(klotz.sd(0.7, 1e-5)) == pytest.approx((moved[0] - moved[1]) / 2.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".nc"])
+def test_a_pressure_is_written_as_it_was_given(ventricle, tmp_path, suffix):
+    observe = observations(parse_observation(ventricle, "volume@ED+klotz:1.30@low"))
+    data = {"volume@ED": 130.0, "klotz:1.30@low": 131.0}
+    write_data(tmp_path / f"d{suffix}", observe, data)
+    back, values = read_measurements(ventricle, tmp_path / f"d{suffix}")[:2]
+    assert {name: float(value) for name, value in values.items()} == data
+    assert back.parts["klotz:1.30@low"].measured_pressure == 1.3
+    renamed = {"klotz:1.4@low": observe.parts["klotz:1.30@low"]}
+    with pytest.raises(InputError, match=r"'klotz:1.4@low' does not fit .* called klotz:1.3"):
+        write_data(tmp_path / "e.csv", observations(renamed), {"klotz:1.4@low": 1.0})
 
 
 def test_one_measured_volume_in_two_more_states(ventricle, tmp_path):
