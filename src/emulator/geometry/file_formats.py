@@ -225,8 +225,8 @@ def _read_abaqus(path: Path) -> meshio.Mesh:
     data = {}
     for name, own in of_set.items():
         member = {kind: np.isin([*each], own).astype(int) for kind, each in elements.items()}
-        solid = not any(each.any() for kind, each in member.items() if kind.startswith("tri"))
-        data[names[name] if solid else f"set:{names[name]}"] = [*member.values()]
+        lower = [each.any() for kind, each in member.items() if kind.startswith(("tri", "line"))]
+        data[f"set:{names[name]}" if any(lower) else names[name]] = [*member.values()]
     return meshio.Mesh(
         np.array([[float(word or 0) for word in xyz[:3]] for xyz in nodes.values()]),
         {

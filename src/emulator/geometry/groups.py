@@ -75,7 +75,7 @@ def _groups(content: meshio.Mesh) -> Iterator[tuple[str, np.ndarray]]:
             if name not in _OF_GMSH and members[k] is not None:
                 yield name, corners[np.asarray(members[k], dtype=np.int64)]
         for name, data in content.cell_data.items():
-            if name.startswith(MARK):
+            if name.startswith(MARK) and not name.endswith(_OF_GMSH):
                 yield name.removeprefix(MARK), corners[np.flatnonzero(data[k])]
         tags = np.ravel(content.cell_data[array][k] if array else [])
         for tag in np.unique(tags[tags < _UNMARKED]).astype(int).tolist():

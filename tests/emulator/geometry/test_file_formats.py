@@ -192,6 +192,8 @@ def test_sets_and_surfaces_of_abaqus(tmp_path, mesh):
             "*Surface, name=empty",
             "half, SPOS",
             "*Nset, nset=nodes_of_half, elset=half",
+            "*Element, type=T3D2, elset=wire",
+            f"1001, {left[0]}, {left[1]}",
             "*Material, name=m",
         ]
     )
@@ -201,6 +203,7 @@ def test_sets_and_surfaces_of_abaqus(tmp_path, mesh):
         np.testing.assert_array_equal(body.mesh.node_set(name), np.sort(left) - 11)
     assert len(body.mesh.facet_set("load")) == len(mesh.facet_set("left"))
     assert set(body.mesh.node_sets["load"]) == set(left - 11)
+    np.testing.assert_array_equal(body.mesh.node_set("wire"), np.sort(left[:2]) - 11)
     assert "'nobody' in again" in body.unused
     assert "surface empty, which has no faces S1 to S4" in body.unused
     assert "set nodes_of_half, which has no members of its own" in body.unused
