@@ -133,6 +133,7 @@ def evidence_of(
     """
     pool, figures = tests.pool, figures_of(posterior, tests)
     missed = missed_by(tests, Runs.joined([training, tests.runs]))
+    means, valid = pool.predictive.means(at_draws.z)
     z = pool.z[pool.resampled(_DRAWS, rng)]
     return Evidence(
         *figures,
@@ -140,7 +141,7 @@ def evidence_of(
         physics_of(at_draws, training, tests),
         tail_of(tests, missed, modes),
         misfits(pool.predictive, pool.correction, z, key_from(rng)),
-        map_errors(pool.predictive, at_draws),
+        in_noise_sd(posterior.model, (means - at_draws.means)[valid & at_draws.converged]),
         box=tuple(posterior.box_ends()),
     )
 
@@ -244,13 +245,6 @@ def physics_of(at_draws: Runs, training: Runs, tests: Tests) -> Physics:
         sum(not s for s in examined),
         len(examined),
     )
-
-
-def map_errors(predictive: Predictive, at_draws: Runs) -> dict[str, float]:
-    """Return the distance of the map's data from FEM's in noise sd, by the observation's name."""
-    means, valid = predictive.means(at_draws.z)
-    rows = valid & at_draws.converged
-    return in_noise_sd(predictive.model, (means - at_draws.means)[rows])
 
 
 def missed_by(tests: Tests, runs: Runs) -> int:

@@ -14,14 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from calibrate.posterior.box import BoxEnd, in_words
-from calibrate.posterior.diagnosis import (
-    MAP_FIRST,
-    SMALLEST_P,
-    Misfit,
-    Sampling,
-    map_fault,
-    sampling_faults,
-)
+from calibrate.posterior.diagnosis import SMALLEST_P, Misfit, Sampling, map_fault, sampling_faults
 from emulator.core.display import TableRepr
 
 Verdict = Literal["accepted", "reweight", "not certified", "undecided"]
@@ -203,8 +196,7 @@ class Evidence:
     corrected : the changes from the corrected map's posterior to FEM's.
     mean, sd : the mean and sd of each parameter under FEM, in its unit.
     misfit : the posterior predictive check of each observation.
-    map_errors : the distance of the map's data from FEM's at the draws, in noise sd, by
-        observation; empty where the likelihood allows for it.
+    map_errors : the distance of the map's data from FEM's at the draws, in noise sd.
     mesh : the changes by a finer mesh.
     box : the ends of ranges that end the posterior in place of the data.
     """
@@ -323,7 +315,7 @@ def judge(evidence: Evidence) -> Certificate:
     elif mesh_is_fine is None and verdict in ("accepted", "reweight"):
         verdict = "undecided"
     if wrong_map and (faults or not agrees):  # then chains are no fault of the sampler
-        faults = [wrong_map, *((words, MAP_FIRST) for words, _ in faults)]
+        faults = [wrong_map, *((words, "mend the map first") for words, _ in faults)]
     faults += others
     if evidence.mesh.why and verdict == "accepted":
         agreement = [(f"{agreement[0][0]} on this mesh", "")]

@@ -28,8 +28,7 @@ from emulator.core.errors import InputError
 from emulator.scenes.scene import Scene
 
 LARGEST_SHARE = 0.03
-"""The largest default standard deviation of noise as a share of what is observed of the body; the
-usual sd of every kind is below that for bodies of a few centimetres."""
+"""Largest default sd of noise as a share of the body's size, or of the cavity's volume."""
 
 LENGTH_UNITS: Mapping[str, float] = {"m": 1e3, "cm": 10.0, "µm": 1e-3}
 """Units that lengths in mm may come in by mistake, each in mm."""
@@ -87,8 +86,7 @@ class Observation(ABC):
     quantity : the measured quantity, such as ``displacement``.
     unit : the unit of the data; ``1`` where it has none.
     other_units : units the data may be in by mistake, each with the factor that converts it.
-    usual_sd : the standard deviation of the noise where none is given, unless the body is small
-        (:meth:`noise_in`); None if it must be given.
+    usual_sd : the standard deviation of the noise where none is given; None if it must be given.
     positive : whether the number must be above 0.
     nodes : the nodes whose displacement it needs, (k,).
 

@@ -28,17 +28,11 @@ from scipy.stats import ks_2samp
 
 from calibrate.arviz import base, stats
 from calibrate.posterior.box import BoxEnd, in_words
+from calibrate.samplers import diagnostics as limits
 from calibrate.samplers import r_hat
-from calibrate.samplers.diagnostics import (
-    ENOUGH_ESS,
-    REFUSE_ABOVE_R_HAT,
-    REFUSE_BELOW_ESS,
-    WARN_ABOVE_R_HAT,
-)
 from calibrate.samplers.laplace import MISSED_AT, MISSED_BY
 
-# Attributes of a run: errors of the map at its draws (:func:`map_fault`), and sentences on noises
-# of its own choice, as JSON.
+# Attributes of a run, as JSON: errors of the map at its draws, sentences on noises by default.
 MAP_ERRORS, SCALED_NOISE = "map_errors", "scaled_noise"
 
 SMALLEST_P = 0.005
@@ -52,8 +46,7 @@ _LOWEST_EFFICIENCY = 0.2
 _LOWEST_ACCEPTANCE = 0.1
 _MANY = 100.0
 _MARKED = 0.5  # standard deviations from which a shift of divergences is reported
-# Of a posterior that is the prior: least sd over the prior's, and largest difference of the
-# cumulative distributions. 500 draws of five unknowns from the same Gaussian have 0.85 and 0.1.
+# Of a posterior that is the prior: least sd over the prior's, largest difference of probabilities.
 _LITTLE_SD, _LITTLE_MOVED = 0.8, 0.15
 _NAMED = 3  # largest number of parameters that a sentence names
 
@@ -87,7 +80,7 @@ def sampling_faults(s: Sampling, box: Sequence[BoxEnd] = ()) -> Iterator[Fault]:
         yield ("the draws of a parameter do not vary", "the sampler is stuck")
     elif not np.isfinite(s.r_hat):
         yield ("R-hat is not a number", "draw more")
-    elif not s.r_hat <= REFUSE_ABOVE_R_HAT:
+    elif not s.r_hat <= limits.REFUSE_ABOVE_R_HAT:
         yield (f"the chains disagree, R-hat {s.r_hat:.3f}", "draw more, or find their modes")
     if not s.divergences <= max(LARGEST_DIVERGENT * s.transitions, 1):
         yield (
@@ -95,9 +88,12 @@ def sampling_faults(s: Sampling, box: Sequence[BoxEnd] = ()) -> Iterator[Fault]:
             "the sampler cannot follow the posterior everywhere; raise target_accept"
             + ("" if box else ", or narrow a prior the data leaves open"),
         )
-    if s.vary and not np.min([s.ess_bulk, s.ess_tail]) >= REFUSE_BELOW_ESS:
+    if s.vary and not np.min([s.ess_bulk, s.ess_tail]) >= limits.REFUSE_BELOW_ESS:
         few = f"{s.ess_bulk:.0f} in the bulk and {s.ess_tail:.0f} in the tails"
-        yield (f"too few effective draws, {few}", f"draw until both reach {REFUSE_BELOW_ESS:.0f}")
+        yield (
+            f"too few effective draws, {few}",
+            f"draw until both reach {limits.REFUSE_BELOW_ESS:.0f}",
+        )
 
 
 def map_fault(errors: Mapping[str, float]) -> Fault | None:
@@ -180,7 +176,7 @@ def diagnose(
     name = max(r_hats, key=lambda n: np.nan_to_num(r_hats[n], nan=np.inf))
     if not np.isfinite(r_hats[name]):
         yield f"R-hat of {name} is not a number: too few draws, or draws that do not vary"
-    elif r_hats[name] > WARN_ABOVE_R_HAT:
+    elif r_hats[name] > limits.WARN_ABOVE_R_HAT:
         cure = (
             "run longer; if it stays, there are several modes or a long ridge, for which sampler "
             "smc is made"
@@ -189,10 +185,10 @@ def diagnose(
         yield f"{disagree}: {cure if wrong_map is None else MAP_FIRST}"
     sizes = {n: min(row["ess_bulk"], row["ess_tail"]) for n, row in summary.items()}
     name = min(sizes, key=lambda n: sizes[n])
-    if not sizes[name] >= ENOUGH_ESS:
+    if not sizes[name] >= limits.ENOUGH_ESS:
         yield (
-            f"{sizes[name]:.0f} effective draws of {name}, fewer than {ENOUGH_ESS:.0f}: quantiles "
-            f"are uncertain; {'take more draws' if wrong_map is None else MAP_FIRST}"
+            f"{sizes[name]:.0f} effective draws of {name}, fewer than {limits.ENOUGH_ESS:.0f}: "
+            f"quantiles are uncertain; {'take more draws' if wrong_map is None else MAP_FIRST}"
         )
     if (rate := float(np.mean(statistics.get("accepted", 1.0)))) < _LOWEST_ACCEPTANCE:
         yield (
@@ -231,12 +227,11 @@ def nothing_learned(tree: xr.DataTree, unknowns: Sequence[str], noise: str) -> l
         for group in ("prior", "posterior")
     )
     moved = max(ks_2samp(*rows).statistic for rows in zip(before, after, strict=True))
-    with np.errstate(invalid="ignore"):
-        sds = np.sqrt(eigvalsh(np.atleast_2d(np.cov(after)), np.atleast_2d(np.cov(before))))
-    if not (sds[0] >= _LITTLE_SD and moved <= _LITTLE_MOVED):
+    least = np.sqrt(eigvalsh(np.atleast_2d(np.cov(after)), np.atleast_2d(np.cov(before)))[0])
+    if not (least >= _LITTLE_SD and moved <= _LITTLE_MOVED):
         return []
     return [
-        f"the data say next to nothing: what is known best keeps {100 * min(sds[0], 1.0):.0f} % of "
+        f"the data say next to nothing: what is known best keeps {100 * min(least, 1.0):.0f} % of "
         f"its prior sd. Their noise is {noise}: give your data's if it is smaller (--noise), or "
         "observe more"
     ]

@@ -74,10 +74,9 @@ def infer(
             simulator=problem.simulator if sampler.solves_fem else None,
             checkpoint=None if target is None else target / SAMPLING,
         )
-        attributes: dict[str, Any] = {SCALED_NOISE: problem.scaled_noise}
-        if not (sampler.solves_fem or isinstance(model.full, FEMForward)):
-            errors = map_errors(posterior.model, problem.simulator, posterior.draws())
-            attributes[MAP_ERRORS] = errors
+        of_fem = sampler.solves_fem or isinstance(model.full, FEMForward)
+        errors = {} if of_fem else map_errors(posterior.model, problem.simulator, posterior.draws())
+        attributes = {SCALED_NOISE: problem.scaled_noise, MAP_ERRORS: errors}
         posterior.tree.attrs.update(as_attributes(attributes))
         if target is not None:
             save_results(target, problem, posterior)

@@ -19,7 +19,6 @@ import numpy as np
 
 from calibrate.measurements import Observations, parse_observation
 from calibrate.measurements.data import read_measurements
-from calibrate.measurements.observation import LARGEST_SHARE
 from calibrate.priors import prior_of
 from calibrate.project.run import Run
 from calibrate.state_names import split
@@ -86,9 +85,8 @@ class Problem:
         noise, parts = self.run.noise, {split(n)[0]: p for n, p in self.observe.parts.items()}
         assert isinstance(noise, Mapping)
         return [
-            f"{name} has the default noise, sd {noise[name]:g} {part.unit}, which is "
-            f"{100 * LARGEST_SHARE:.0f} % of {part.size_in(self.scene):.2g} {part.unit} at rest: "
-            f"give your data's, --noise {name}=SD"
+            f"{name} has the default noise of so small a body ({part.size_in(self.scene):.2g} "
+            f"{part.unit}), sd {noise[name]:g} {part.unit}: give your data's, --noise {name}=SD"
             for name, part in parts.items()
             if noise.get(name) != part.usual_sd is not None
             and noise.get(name) == part.noise_in(self.scene).upper_sd

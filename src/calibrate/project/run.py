@@ -144,10 +144,7 @@ class Run:
         return sampler, options_from(sampler, self.sampler_options, **length)
 
     def named(self, observe: Observations, scene: Scene | None = None) -> Run:
-        """Return the run with every noise by the observation's name, the defaults filled in.
-
-        scene : the scene whose size limits the defaults.
-        """
+        """Return the run with every noise by name; defaults fit the size of ``scene``."""
         scales = _by_name(self.noise_scale, observe, "noise-scale")
         noise = _by_name(self.noise, observe, "noise")
         expanded = observe.expand(noise, "noise")

@@ -203,11 +203,9 @@ def with_error(
 def map_errors(
     model: Model, simulator: Simulator, draws: Mapping[str, np.ndarray]
 ) -> dict[str, float]:
-    """Return the map's errors as of :func:`in_noise_sd`, by a Newton step at a few of ``draws``.
+    """Return the map's errors as of :func:`in_noise_sd`, to first order, without FEM runs.
 
-    The step is the map's distance from equilibrium to first order; no FEM run is made.
-
-    draws : draws of the posterior, (s,) each by the unknown's name.
+    draws : draws (s,) by the unknown's name, at a few of which a Newton step is taken.
     """
     if simulator.scene.loaded_by:
         return {}  # its equations are of two displacements: at rest, and from there to the mesh
@@ -219,8 +217,8 @@ def map_errors(
         thetas = model.states.thetas({name: values[row] for name, values in draws.items()})
         u = jnp.stack([predict(theta) for theta in thetas])
         off = jnp.stack([step(each, theta).error for each, theta in zip(u, thetas, strict=True)])
-        by_map, closer = (observe(each[:, observe.nodes], thetas) for each in (u, u - off))
-        error = ravel_pytree(by_map)[0] - ravel_pytree(closer)[0]
+        seen = (observe(each[:, observe.nodes], thetas) for each in (u, u - off))
+        error = jnp.subtract(*(ravel_pytree(each)[0] for each in seen))
         errors += [error] if bool(jnp.all(jnp.isfinite(error))) else []
     return in_noise_sd(model, np.array(errors))
 
@@ -228,8 +226,7 @@ def map_errors(
 def in_noise_sd(model: Model, errors: np.ndarray) -> dict[str, float]:
     """Return the size of the map's errors in noise sd, by the observation's name.
 
-    It is the root mean square over an observation's numbers, and the median over the draws. Empty
-    without draws, and where the likelihood allows for the map's error.
+    Root mean squares over its numbers, medians over draws; empty if the likelihood allows for them.
 
     errors : the map's data less FEM's at draws, flat (s, m).
     """

@@ -139,7 +139,7 @@ def add_discrepancy(
     sums = _sums(emulator, series)
     errors: dict[str, float] = {}
     trials: dict[str, Emulator] = {}
-    held_out: dict[str, Any] = {}
+    record: dict[str, Any] = {}
     best = next((n for n in ("coarse", "taylor") if n in sums), "nothing")
     if count >= FEWEST:
         test = np.arange(count) % _HELD_OUT == _HELD_OUT - 1
@@ -147,12 +147,12 @@ def add_discrepancy(
             trials[name] = fitted(bare, runs.take(~test))
             errors[name] = _error(trials[name], runs.take(test))
         best = min(errors, key=errors.__getitem__)
-        held_out = evaluate(trials[best].cache(), *runs.take(test)[:2])
+        record["held_out"] = evaluate(trials[best].cache(), *runs.take(test)[:2])
     final_model = fitted(sums[best], runs)
     assert final_model.discrepancy is not None, "it was fitted above"
     modes = len(final_model.discrepancy.modes)
-    record = {"on": best, "runs": count, "modes": modes, "held_out_err_u_mm": errors}
-    return final_model, record | ({"held_out": held_out} if held_out else {})
+    record |= {"on": best, "runs": count, "modes": modes, "held_out_err_u_mm": errors}
+    return final_model, record
 
 
 def _sums(emulator: Emulator, series: Expansion) -> dict[str, Emulator]:

@@ -146,7 +146,8 @@ def test_a_default_is_no_larger_than_the_body_allows_and_said_to_be_that():
     assert problem.run.noise["length:3:14"] == pytest.approx(0.03 * mouse.mesh.size, rel=0.02)
     assert (problem.run.noise["displacement"], problem.run.noise["strain"]) == (0.2, 0.02)
     first, second = problem.scaled_noise
-    assert f"volume has the default noise, sd {problem.run.noise['volume']:g} mL" in first
+    assert first.startswith("volume has the default noise of so small a body (0.")
+    assert f"sd {problem.run.noise['volume']:g} mL: give your data's, --noise volume=SD" in first
     assert "--noise length:3:14=SD" in second
     given = read_problem(replace(run, noise={"volume": 1.0, "length:3:14": 0.5}), scene=mouse)
     assert given.scaled_noise == []

@@ -140,12 +140,10 @@ def _training_summary(folder: str, scene: str, record: Mapping[str, Any]) -> str
     if error is None:
         return f"{text}; errors of forces, volumes and strains: calibrate evaluate {folder}"
     text += f"; {error:.2g} mm from FEM at held-out runs"
-    observed = {"err_R": "force of a support", "err_V": "cavity volume", "err_E": "strain"}
-    found = choice.get("held_out", {})
-    worst = [f"{found[name]['max']:.2g} {found['units'][name]} in {what}".replace(" 1 in", " in")
-             for name, what in observed.items() if name in found]  # fmt: skip
-    if "max_R" in found and worst:
-        worst[0] += f" (the largest is {found['max_R']['max']:.2g} N)"
+    told = choice.get("held_out", {})
+    of = f"N of up to {told.get('max_R', {}).get('max', 0.0):.2g} N in the force of a support"
+    words = {"err_R": of, "err_V": "% of a cavity", "err_E": "in strain"}
+    worst = [f"{told[name]['max']:.2g} {what}" for name, what in words.items() if name in told]
     return f"{text}, at worst {', '.join(worst)}" if worst else text
 
 
