@@ -190,12 +190,15 @@ def cut(surface: Surface, point: np.ndarray, normal: np.ndarray) -> Surface:
     vertices, numbered = np.unique(rows, return_inverse=True)
     places = np.concatenate([points, np.array(new).reshape(-1, 3)])[vertices]
     below_it = Surface(surface.name, places, numbered.reshape(-1, 3))
-    one_rim(below_it)
+    one_rim(below_it, is_cut=True)
     return below_it
 
 
-def one_rim(surface: Surface) -> np.ndarray:
-    """Return the edges (e, 2) of the only opening; :class:`InputError` locates the others."""
+def one_rim(surface: Surface, is_cut: bool = False) -> np.ndarray:
+    """Return the edges (e, 2) of the only opening; :class:`InputError` locates the others.
+
+    is_cut : whether it is what a base plane has left.
+    """
     rims = sorted(surface.rims, key=len)
     if len(rims) == 1:
         return rims[0]
@@ -205,10 +208,12 @@ def one_rim(surface: Surface) -> np.ndarray:
             "point: --axis with --base-height or --base-point"
         )
     small = surface.points[np.unique(rims[0])].mean(axis=0)
+    remedy = "give a base plane below them, --base-height or --base-point, and --axis"
+    if is_cut:
+        remedy = "lower the base plane, --base-height or --base-point, or turn --axis around"
     raise InputError(
         f"{surface.name}: it has {len(rims)} openings, the smallest of {len(rims[0])} edges at "
-        f"{place_of(small)}; expected the base's alone: fill the others, or give --axis and a base "
-        "plane below them, --base-height or --base-point"
+        f"{place_of(small)}; expected the base's alone: fill the others, or {remedy}"
     )
 
 

@@ -36,7 +36,7 @@ from emulator.geometry.surfaces import (
     smoothed,
 )
 
-_LEAST = 4.0  # mm; nobody's heart is smaller, a mouse's being 7 mm long
+_EXTENTS = 4.0, 600.0  # mm; nobody's heart is smaller or larger, a mouse's being 7 mm long
 _MOST_CUT = 0.2  # of the epicardium's height: rims that stand further apart are no base
 _SIZE = 0.7  # of the median thickness: some 5000 quadratic nodes for a human ventricle
 _SAME = 1e-3  # of the extent: rims this flat are not cut
@@ -248,10 +248,10 @@ def _doubts(wall: Wall, smooth_cavity: float) -> Iterator[str]:
 
 def _surface(source: str | Path | Surface, name: str, unit: str) -> Surface:
     surface = source if isinstance(source, Surface) else read_surface(source, name, UNITS[unit])
-    if surface.extent < _LEAST:
+    if not _EXTENTS[0] <= surface.extent <= _EXTENTS[1]:
         raise InputError(
-            f"{name}: it is {surface.extent:.3g} mm from corner to corner; lengths are taken as "
-            "mm: give --unit m or cm"
+            f"{name}: it is {surface.extent:.3g} mm from corner to corner, lengths being taken as "
+            f"{unit}: give the file's own --unit, {', '.join(UNITS)}"
         )
     return surface
 
@@ -283,12 +283,16 @@ def _plane(
         middle = np.mean([each.points[edges].mean(axis=(0, 1)) for each, edges in rims], axis=0)
         normal *= np.sign((middle - surfaces[1].points.mean(axis=0)) @ normal)
     if normal.shape != (3,) or not np.isfinite(normal).all() or not normal.any():
-        raise InputError(f"long axis {axis}: expected three numbers, not all zero")
+        raise InputError(f"long axis {axis}: expected three numbers, not all zero: --axis X Y Z")
     normal = normal / np.linalg.norm(normal)
-    if point is not None:
-        return normal, np.asarray(point, dtype=float)
-    if height is not None:
-        return normal, height * normal
+    if has_plane:
+        place = height * normal if height is not None else np.asarray(point, dtype=float)
+        if place.shape != (3,) or not np.isfinite(place).all():
+            raise InputError(
+                f"base plane {height if point is None else point}: expected a finite height, "
+                "--base-height, or three numbers, --base-point X Y Z"
+            )
+        return normal, place
     levels = np.concatenate([each.points[np.unique(edges)] @ normal for each, edges in rims])
     tall = np.ptp(surfaces[1].points @ normal)
     if np.ptp(levels) > _MOST_CUT * tall:
