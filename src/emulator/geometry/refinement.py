@@ -77,17 +77,17 @@ def unfolded(mesh: Mesh) -> tuple[Mesh, int]:
     chord, share = mesh.nodes.copy(), np.ones((len(mesh.nodes), 1))
     chord[middles] = mesh.nodes[edges].mean(axis=2)
     least = _LEAST_JACOBIAN * 6.0 * signed_volumes(mesh.nodes, mesh.elements)
-    folded = np.zeros(len(mesh.elements), dtype=bool)
+    is_folded = np.zeros(len(mesh.elements), dtype=bool)
     while True:
         nodes = chord + share * (mesh.nodes - chord)
         jacobian = np.einsum("mai,qaj->mqij", nodes[mesh.elements], slopes)
         now = (np.linalg.det(jacobian) < least[:, None]).any(axis=1)
         now &= share[middles].any(axis=(1, 2))  # what is straight already stays as it is
         if not now.any():
-            return replace(mesh, nodes=nodes) if folded.any() else mesh, int(folded.sum())
-        folded |= now
-        moved = np.unique(middles[now])
-        share[moved] = np.where(share[moved] > _LEAST_SHARE, 0.5 * share[moved], 0.0)
+            return replace(mesh, nodes=nodes) if is_folded.any() else mesh, int(is_folded.sum())
+        is_folded |= now
+        bent = np.unique(middles[now])
+        share[bent] = np.where(share[bent] > _LEAST_SHARE, 0.5 * share[bent], 0.0)
 
 
 def to_linear(mesh: Mesh) -> Mesh:

@@ -170,37 +170,37 @@ def mesh_wall(
                 "one: --base-height or --base-point"
             )
     height = max(((each.points - point) @ normal).max() for each in intact)
-    lost = (intact[1].volume - below[1].volume) / MM3_PER_ML
+    above = (intact[1].volume - below[1].volume) / MM3_PER_ML
     is_cut = height > _SAME * intact[1].extent
     inner, outer = (smoothed(each, smooth) for each in below)
     _check_nested(inner, outer, normal)
     thickness = _thickness(inner, outer)
-    wished = _SIZE * thickness.median if size is None else size
-    if not 0.0 < wished < intact[1].extent / 4.0:
+    target = _SIZE * thickness.median if size is None else size
+    if not 0.0 < target < intact[1].extent / 4.0:
         raise InputError(
-            f"--size {wished} mm: expected edges above 0 and below a quarter of the epicardium's "
+            f"--size {target} mm: expected edges above 0 and below a quarter of the epicardium's "
             f"extent, {intact[1].extent:.4g} mm"
         )
     maps = [DiscMap(inner), DiscMap(outer)]
-    fitting, curved = _mesh_that_fits(maps, wished, order, normal, point)
-    if size is not None and fitting < size:
+    length, before = _mesh_that_fits(maps, target, order, normal, point)
+    if size is not None and length < size:
         raise InputError(
             f"the wall, {thickness.least:.3g} mm where it is thinnest, is too thin for edges of "
-            f"{size:.3g} mm: --size {fitting:.4g} fits"
+            f"{size:.3g} mm: --size {length:.4g} fits"
         )
-    mesh, folded = unfolded(curved) if order == 2 else (curved, 0)
+    mesh, folded = unfolded(before) if order == 2 else (before, 0)
     cavity, whole = (each.volume / MM3_PER_ML for each in below)
     wall = Wall(
         mesh=mesh,
         axis=normal,
         base=below[0].points[np.unique(one_rim(below[0]))].mean(axis=0),
-        size=float(fitting),
+        size=float(length),
         thickness=thickness,
         cavity=(Cavity(mesh, "endocardium").rest, cavity),
         wall=(float(discretise(mesh).weights.sum()) / MM3_PER_ML, whole - cavity),
-        cut_off=(float(height), lost) if is_cut else (0.0, 0.0),
+        cut_off=(float(height), above) if is_cut else (0.0, 0.0),
         moved=_farthest(inner.points, below[0].points, outer.points, below[1].points),
-        folded=(folded, _farthest(mesh.nodes, curved.nodes)),
+        folded=(folded, _farthest(mesh.nodes, before.nodes)),
         warnings=(),
         quality=mesh_quality(mesh),
     )
@@ -215,11 +215,11 @@ def _farthest(*points: np.ndarray) -> float:
 
 def _doubts(wall: Wall, smooth_cavity: float) -> Iterator[str]:
     """Yield what is doubtful of a wall, whose smoothed endocardium encloses so many mL."""
-    (cavity, own), (volume, _), (_, lost) = wall.cavity, wall.wall, wall.cut_off
-    if lost > cavity + volume:
+    (cavity, own), (volume, _), (_, above) = wall.cavity, wall.wall, wall.cut_off
+    if above > cavity + volume:
         x, y, z = -wall.axis + 0.0
         yield (
-            f"the base plane cuts off {lost:.4g} mL and leaves {cavity + volume:.4g}: does the "
+            f"the base plane cuts off {above:.4g} mL and leaves {cavity + volume:.4g}: does the "
             f"axis lead from apex to base? The other way round: --axis {x:.4g} {y:.4g} {z:.4g} "
             f"--base-height {-(wall.base @ wall.axis) + 0.0:.4g}"
         )
@@ -358,10 +358,8 @@ def _mesh(
     (inner, in_disc), (outer, out_disc) = (each.remeshed(size) for each in maps)
     outside = ~inside(outer, inner.points, normal)
     within = inside(inner, outer.points, normal)
-    if (crossing := np.concatenate([inner.points[outside], outer.points[within]])).size:
-        raise Unmeshable(
-            f"the wall is too thin for edges of {size:.3g} mm at {place_of(crossing[0])}"
-        )
+    if (bad := np.concatenate([inner.points[outside], outer.points[within]])).size:
+        raise Unmeshable(f"the wall is too thin for edges of {size:.3g} mm at {place_of(bad[0])}")
     frame = axes_across(normal)
     # Points of a rim come first, in its order.
     loops = [each.points[: len(one_rim(each))] for each in (outer, inner)]
