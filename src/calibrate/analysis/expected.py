@@ -172,22 +172,19 @@ def expected_precision(
             "identifiability: give every noise a known sd, as in GaussianNoise(sd=...)"
         )
     errors: Errors = errors_of_data(model, systematic) if systematic else lambda _: model.error
-    names, prior = model.states.unknowns, prior_table(model)
-    x = np.asarray(model.on_scales(prior))
-    before = np.atleast_2d(np.cov(x, rowvar=False))
-    mean = prior.mean(axis=0)
+    names, table = model.states.unknowns, prior_table(model)
+    mean, prior = table.mean(axis=0), np.asarray(model.on_scales(table))
+    before = np.atleast_2d(np.cov(prior, rowvar=False))
     if at is None:
-        covariances = _posterior_covariances(model, errors, x, before, data_sets, seed)
+        covariances = _posterior_covariances(model, errors, prior, before, data_sets, seed)
     else:
         means, valid = model.predict({name: jnp.asarray(float(at[name])) for name in names})
         _some(valid)
         error = errors(means)
         information_of = information_at(model, model.observe, model.noise)
         mean = np.array([float(at[name]) for name in names])
-        centre = model.on_scales(mean)
-        by_size = jax.jit(jax.vmap(lambda sizes: information_of(centre, error, sizes)))(
-            sizes_of(error)
-        )
+        x = model.on_scales(mean)
+        by_size = jax.jit(jax.vmap(lambda sizes: information_of(x, error, sizes)))(sizes_of(error))
         covariances = np.linalg.inv(np.asarray(by_size) + np.linalg.inv(before))
     sd = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)).mean(axis=0)
     ratio = sd / np.sqrt(np.diagonal(before))

@@ -242,8 +242,7 @@ def sbc(
             truth = replace(truth, forward=solved_by(truth.forward, execute))
         data_sets = predictions.prior_replicates(truth, jax.random.key(seed), replicates)
     if (found := len(data_sets.draws[truth.names[0]])) < _FEWEST:
-        (sentence,) = predictions.shortfall(found, replicates)
-        raise InputError(f"calibration: {sentence}")
+        raise InputError(f"calibration: {predictions.shortfall(found, replicates)[0]}")
     each = _replicates(model, data_sets, draw or sampled, seed, progress=progress)
     return calibration_of(each, seed)
 

@@ -158,17 +158,12 @@ class PointObservation(Observation):
         """
         place, *fields = table.fields
         places = arrays[place.variable]
-        width = f" {len(place.columns)}" * (len(place.columns) > 1)
-        if np.ndim(places) != 1 + bool(width):
-            raise InputError(
-                f"'{place.variable}' has shape {np.shape(places)}; expected (d,{width})"
-            )
+        if np.ndim(places) != 1 + (len(place.columns) > 1):
+            raise InputError(f"'{place.variable}' has shape {np.shape(places)}; give a row a point")
         what, components = cls.quantity, sum(len(field.columns) for field in fields)
-        for field in fields if len(fields) > 1 else ():
-            if len(column := np.atleast_1d(arrays[field.variable])) != len(places):
-                raise InputError(
-                    f"{len(places)} points have {len(column)} {what}s '{field.variable}'"
-                )
+        counts = [np.size(arrays[field.variable]) for field in fields]
+        if len(set(counts)) > 1:
+            raise InputError(f"components of {what}s have {', '.join(map(str, counts))} values")
         values = np.column_stack([arrays[field.variable] for field in fields])
         if values.ndim != 2 or not len(values) or values.shape[1] != components:
             raise InputError(f"{what}s have shape {values.shape}; expected (d, {components})")

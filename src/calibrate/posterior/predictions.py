@@ -78,8 +78,7 @@ def replicates(
 def prior_replicates(model: Model, rng_key: jax.Array, count: int = REPLICATES) -> Prior:
     """Return up to ``count`` draws of the prior, and data replicated there.
 
-    A tenth more is drawn; draws where the forward map has no answer are left out. If more than that
-    are, :func:`shortfall` says so.
+    A tenth more is drawn; draws at which the map has no answer are left out (:func:`shortfall`).
     """
     keys = jax.random.split(rng_key, count + count // 10)
     if isinstance(model.forward, FEMForward):

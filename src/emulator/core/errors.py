@@ -36,10 +36,7 @@ def check_known(name: object, known: Iterable[str], noun: str) -> None:
 
 
 def check_arguments(options: Iterable[str], what: str, *functions: Callable[..., Any]) -> None:
-    """Raise :class:`InputError` for an option that none of ``functions`` takes by its name alone.
-
-    what : the function that the user called; it begins the message.
-    """
+    """Raise :class:`InputError`, about ``what``, for an option that no function takes by name."""
     parameters = [each for f in functions for each in signature(f).parameters.values()]
     known = dict.fromkeys(each.name for each in parameters if each.kind is each.KEYWORD_ONLY)
     for option in options:

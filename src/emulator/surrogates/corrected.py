@@ -85,11 +85,9 @@ class CorrectedForward:
             (theta, _), (direction, _) = primals, tangents
             u = correct(*primals)
             # Zero times the derivative at an impossible displacement would be NaN.
-            at = jnp.where(self._possible(u), u, 0.0)
-            tangent = system.pattern.safe_values(system.tangent(at, theta))
-            _, (force, prescribed) = jax.jvp(
-                system.residual_on_supports(at), (theta,), (direction,)
-            )
+            v = jnp.where(self._possible(u), u, 0.0)
+            tangent = system.pattern.safe_values(system.tangent(v, theta))
+            _, (force, prescribed) = jax.jvp(system.residual_on_supports(v), (theta,), (direction,))
             return u, prescribed + system.extend(-system.solve(tangent, force))
 
         return correct

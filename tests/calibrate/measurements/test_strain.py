@@ -253,16 +253,19 @@ def test_files_that_are_wrong(ventricle, tmp_path, text, message):
 @pytest.mark.parametrize(
     ("arrays", "said"),
     [
-        ({"E_circ": 6, "E_rad": 5}, "6 points have 5 strains 'E_rad'"),
-        ({"E_circ": 4, "E_rad": 6}, "6 points have 4 strains 'E_circ'"),
-        ({"E_circ": 5, "E_rad": 5}, "6 points have 5 strains 'E_circ'"),
-        ({"E_circ": (), "E_rad": 6}, "6 points have 1 strains 'E_circ'"),
-        ({"segment": 3, "mean_E_circ": 3, "mean_E_rad": 2}, "3 points have 2 strains 'mean_E_rad'"),
-        ({"segment": (3, 3), "mean_E_circ": 3}, "'segment' has shape (3, 3); expected (d,)"),
-        ({"segment": (), "mean_E_circ": 1}, "'segment' has shape (); expected (d,)"),
+        ({"E_circ": 6, "E_rad": 5}, "components of strains have 6, 5 values"),
+        ({"E_circ": 4, "E_rad": 6}, "components of strains have 4, 6 values"),
+        ({"E_circ": 5, "E_rad": 5}, "6 points have 5 strains"),
+        ({"E_circ": (), "E_rad": 6}, "components of strains have 1, 6 values"),
+        (
+            {"segment": 3, "mean_E_circ": 3, "mean_E_rad": 2},
+            "components of strains have 3, 2 values",
+        ),
+        ({"segment": (3, 3), "mean_E_circ": 3}, "'segment' has shape (3, 3); give a row a point"),
+        ({"segment": (), "mean_E_circ": 1}, "'segment' has shape (); give a row a point"),
         (
             {"position_strain": (6, 3, 3), "E_circ": 6},
-            "'position_strain' has shape (6, 3, 3); expected (d, 3)",
+            "'position_strain' has shape (6, 3, 3); give a row a point",
         ),
     ],
 )

@@ -102,8 +102,7 @@ def _prior(arguments: Namespace) -> Answer:
     problem = problem_of(arguments)
     run, model = problem.run, model_before_data(problem, progress=not arguments.json)
     replicates = prior_replicates(model, jax.random.key(run.seed))
-    found = len(replicates.draws[model.names[0]])
-    fewer = shortfall(found)
+    fewer = shortfall(found := len(replicates.draws[model.names[0]]))
     if not found:
         raise InputError(fewer[0])
     units = {name: part.unit for name, part in model.observe.parts.items()}
