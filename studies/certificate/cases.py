@@ -7,6 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
+from scipy.stats import truncnorm
 from studies.certificate.problems import (
     APART,
     Map,
@@ -247,11 +248,7 @@ def box_cuts(problem, size, seed):
     upper = rng.random(len(sd)) < 0.5
     for k in ended:
         (high if upper[k] else low)[k] = mean[k] + (size if upper[k] else -size) * sd[k]
-    chosen = np.zeros((0, len(sd)))
-    while len(chosen) < DRAWS:
-        draws = rng.multivariate_normal(mean, covariance, size=100 * DRAWS)
-        inside = ((draws > low) & (draws < high)).all(axis=1)
-        chosen = np.concatenate([chosen, draws[inside]])[:DRAWS]
+    chosen = in_box(mean, covariance, low, high, rng)
     parameters = tuple(
         replace(p, low=float(a), high=float(b), scale="uniform")
         for p, a, b in zip(problem.scene.parameters, low, high, strict=True)
@@ -260,6 +257,20 @@ def box_cuts(problem, size, seed):
     observe = cal.nodal_displacements(exact.scene, problem.nodes)
     model = cal.model(exact, observe, cal.GaussianNoise(sd=problem.noise))
     return posterior_of(model, data, chosen), (mean, sd)
+
+
+def in_box(mean, covariance, low, high, rng, sweeps=200):
+    """Draws (s, p) of a Gaussian in a box: as many Gibbs samplers, side by side."""
+    precision = np.linalg.inv(covariance)
+    x = np.clip(np.tile(mean, (DRAWS, 1)), low, high)
+    sd = np.diag(precision) ** -0.5
+    for _ in range(sweeps):
+        for k in range(len(mean)):
+            others = (x - mean) @ precision[k] - (x[:, k] - mean[k]) * precision[k, k]
+            at = mean[k] - others / precision[k, k]
+            ends = (low[k] - at) / sd[k], (high[k] - at) / sd[k]
+            x[:, k] = truncnorm.rvs(*ends, loc=at, scale=sd[k], random_state=rng)
+    return x
 
 
 def box_touches(problem, size, seed):
