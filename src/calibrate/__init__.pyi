@@ -28,7 +28,7 @@ from .noise import CorrelatedNoise, DiscrepancyNoise, GaussianNoise, StudentTNoi
 from .population import Hierarchy, hierarchy, read_hierarchy
 from .posterior import Posterior, sample
 from .posterior.comparison import compare
-from .posterior.klotz_band import klotz_band
+from .posterior.predictions import klotz_band
 from .priors import (
     Dependence,
     JointPrior,

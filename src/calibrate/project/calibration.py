@@ -37,6 +37,7 @@ def infer(
     folder: str | Path | None = None,
     *,
     force: bool = False,
+    check_map: bool = True,
     progress: bool = False,
 ) -> Posterior:
     """Sample the posterior of a run.
@@ -47,6 +48,8 @@ def infer(
     folder : the folder to write run, data and posterior to (:mod:`calibrate.project.results`). A
         run into a folder that was killed while sampling continues there.
     force : replace the results of an earlier run in ``folder``.
+    check_map : whether a few Newton steps tell how far the forward map is from what is observed;
+        a certificate says so, too, and better.
 
     Raises
     ------
@@ -74,8 +77,9 @@ def infer(
             simulator=problem.simulator if sampler.solves_fem else None,
             checkpoint=None if target is None else target / SAMPLING,
         )
-        of_fem = sampler.solves_fem or isinstance(model.full, FEMForward)
-        errors = {} if of_fem else map_errors(posterior.model, problem.simulator, posterior.draws())
+        errors = {}
+        if check_map and not (sampler.solves_fem or isinstance(model.full, FEMForward)):
+            errors = map_errors(posterior.model, problem.simulator, posterior.draws())
         attributes = {SCALED_NOISE: problem.scaled_noise, MAP_ERRORS: errors}
         posterior.tree.attrs.update(as_attributes(attributes))
         if target is not None:

@@ -63,7 +63,7 @@ def run_demo(
     pyplot()  # reports a missing plotting package before the sampling
     demo = DEMOS[scene]
     run = demo.run
-    posterior = infer(run, folder, force=True, progress=progress)
+    posterior = infer(run, folder, force=True, check_map=False, progress=progress)
     certificate = certify_and_keep(posterior, folder, progress=progress)
     forward = posterior.model.full
     truth = simulator_of(forward.scene, run.load_steps)(forward.scene.theta(**run.truth))

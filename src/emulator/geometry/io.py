@@ -20,8 +20,7 @@ from emulator.core.errors import InputError
 from emulator.core.store import replacing
 from emulator.geometry.discretisation import quadrature_points
 from emulator.geometry.fibres import across, from_elements, from_nodes
-from emulator.geometry.file_formats import read_cells
-from emulator.geometry.groups import MARK, TAG, Sets, read_sets, tag_array, unused
+from emulator.geometry.file_formats import MARK, TAG, Sets, read_cells, read_sets, tag_array, unused
 from emulator.geometry.mesh import Mesh, coincident, find_rows, orient
 from emulator.geometry.refinement import to_quadratic
 

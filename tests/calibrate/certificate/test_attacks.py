@@ -65,6 +65,7 @@ def test_gradients_that_are_not_the_map_s(beam, fem, factor):
         assert (shift > CLOSE_SD).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("wrong_at", "good"), [((20,), False), *(pytest.param(*each, marks=pytest.mark.slow)
                                              for each in (((3, 11), False), ((), True)))]

@@ -47,9 +47,11 @@ def test_bad_meshes_in_scene_files(capsys, block):
     brick = ("hexahedron", [[0, 1, 4, 3, 6, 7, 10, 9]])
     meshio.write(block.parent / "block.vtu", meshio.Mesh(mesh.nodes, [solid, brick]))
     assert "it has hexahedron cells" in complaint(capsys, "simulate", block)
-    tags = [np.zeros(len(mesh.elements), int), np.array([7])]
+    tags = [np.zeros(len(mesh.elements), int), np.array([7, 8])]
     data = {"gmsh:physical": tags, "gmsh:geometrical": tags}
-    file = meshio.Mesh(mesh.nodes, [solid, ("triangle", mesh.surface[:1])], cell_data=data)
+    cells = [solid, ("triangle", mesh.surface[:2])]
+    named = {"wall": np.array([8, 2])}
+    file = meshio.Mesh(mesh.nodes, cells, cell_data=data, field_data=named)
     meshio.write(block.parent / "block.msh", file, file_format="gmsh22", binary=False)
     block.write_text(SCENE.replace("block.vtu", "block.msh"))
     assert "physical group 7 (triangles) has no name" in complaint(capsys, "simulate", block)

@@ -111,6 +111,7 @@ def test_one_member_has_its_posterior_under_the_population(beam):
     close(draws, expected.mean(), expected.std(), 0.5 * ess)
 
 
+@pytest.mark.slow
 def test_a_member_without_data_is_one_not_seen(found):
     together, new = found.member("b1"), found.new_member()
     for name in ("mu", "lam"):
@@ -121,6 +122,7 @@ def test_a_member_without_data_is_one_not_seen(found):
     assert sentence.startswith("the box ends the posterior, not the data: lam[b4] at 100 kPa")
 
 
+@pytest.mark.slow
 def test_members_shrink_towards_the_population(found):
     centre = np.log(found.summary()["median[mu]"]["mean"])
     rows = [row for member, row in found.shrinkage()["mu"].items() if member != "b1"]
@@ -130,6 +132,7 @@ def test_members_shrink_towards_the_population(found):
     assert np.mean([row.sd for row in rows]) < 0.95 * np.mean([row.alone_sd for row in rows])
 
 
+@pytest.mark.slow
 def test_draws_have_names_and_units(found):
     draws = found.draws()
     assert {"median[mu]", "sd[lam]", "correlation[mu, lam]", "mu[b0]", "noise_sd[b2]"} < set(draws)
@@ -142,6 +145,7 @@ def test_draws_have_names_and_units(found):
     assert "Population of 5 members" in repr(found)
 
 
+@pytest.mark.slow
 def test_a_member_that_wants_more_than_the_range_is_told(found):
     tree = found.tree.copy()
     mu = tree["posterior"]["mu"]
@@ -152,6 +156,7 @@ def test_a_member_that_wants_more_than_the_range_is_told(found):
     assert ends == {"mu[b0] at 100 kPa", "lam[b4] at 100 kPa"}
 
 
+@pytest.mark.slow
 def test_a_new_member_is_predicted_through_its_model(found, beam):
     model = model_of(beam, sd=0.05)
     data = found.predict(model, seed=1)["displacement"]
@@ -168,6 +173,7 @@ def test_a_new_member_is_predicted_through_its_model(found, beam):
     assert found.predict(unknown)["displacement"].shape == (500, 3, 3)
 
 
+@pytest.mark.slow
 def test_it_is_a_prior_of_the_next_member(found, beam):
     prior = found.as_prior()
     new = found.new_member()
@@ -176,6 +182,7 @@ def test_it_is_a_prior_of_the_next_member(found, beam):
     assert "mu" in prior.prior(beam)
 
 
+@pytest.mark.slow
 def test_it_is_kept_in_a_file(found, tmp_path):
     found.save(tmp_path / "hierarchy.nc")
     again = cal.read_hierarchy(tmp_path / "hierarchy.nc")
@@ -184,6 +191,7 @@ def test_it_is_kept_in_a_file(found, tmp_path):
     assert again.shrinkage() == found.shrinkage()
 
 
+@pytest.mark.slow
 def test_its_figure_has_a_panel_a_parameter(found, tmp_path):
     pytest.importorskip("matplotlib", reason="figures need matplotlib")
     from calibrate.figures import shrinkage

@@ -96,7 +96,7 @@ MISTAKES = [
     (('"nodes.csv"', '"none.csv"'), "none.csv does not exist"),
     (('"nodes.csv"', "7"), "line 2: data = 7; expected"),
     (("warmup = 40", "warmup = 0"), "line 5: warmup is 0; it must be 1 or more"),
-    (("warmup = 40", "warmups = 40"), "line 5: unknown key 'warmups'; known: chains"),
+    (("warmup = 40", "warmups = 40"), "line 5: unknown key 'warmups'; known: bounded, chains"),
     (("warmup = 40", 'warmup = "long"'), 'line 5: warmup = "long"; expected a whole number'),
     (("[noise]", '[known]\n"mu@high" = 60.0\n[noise]'), "'mu@high': load state 'high' is unknown"),
     (("[noise]", "[known]\nnu = 0.3\n[noise]"), "has no parameter 'nu'; it has mu, lam"),

@@ -19,6 +19,8 @@ from emulator.core.errors import InputError
 from emulator.surrogates.fem import fem_forward
 from linear_support import PRIOR_MEAN, PRIOR_SD, LinearFEM, closed_form, linear_problem
 
+LONG = ("blackjax_nuts", "delayed_acceptance", "mclmc")
+
 
 @pytest.fixture(scope="module")
 def problem(beam):
@@ -27,7 +29,7 @@ def problem(beam):
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(n, marks=pytest.mark.slow) if n == "blackjax_nuts" else n for n in SAMPLERS],
+    [pytest.param(n, marks=pytest.mark.slow if n in LONG else ()) for n in SAMPLERS],
 )
 def test_a_linear_gaussian_posterior_is_the_known_one(name, problem, beam):
     model, data = problem

@@ -169,8 +169,7 @@ def test_no_tangent_on_the_way_is_indefinite(ventricle, monkeypatch):
 @pytest.mark.parametrize(
     "how",
     [
-        "refused",
-        *(pytest.param(how, marks=pytest.mark.slow) for how in ("crushed", "endless")),
+        *(pytest.param(how, marks=pytest.mark.slow) for how in ("refused", "crushed", "endless")),
         "nan",
     ],
 )

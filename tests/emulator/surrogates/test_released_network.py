@@ -50,6 +50,7 @@ def clone(published, tmp_path):
     return tmp_path, path, weights
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "model", [m if m == "TwistingBeam" else pytest.param(m, marks=pytest.mark.slow) for m in MODELS]
 )

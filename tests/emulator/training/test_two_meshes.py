@@ -77,6 +77,7 @@ def test_a_finer_scene_has_a_name():
     assert finer_of(refined).coarse.fingerprint == find_scene("twisting_cube").fingerprint
 
 
+@pytest.mark.slow
 def test_what_it_cannot_stand_on_is_refused(body, coarse, tmp_path):
     with pytest.raises(InputError, match="not on a mesh made finer; name it finer:"):
         train(body.coarse, PLAN, tmp_path, start=coarse)
@@ -92,6 +93,7 @@ def test_what_it_cannot_stand_on_is_refused(body, coarse, tmp_path):
         train(body.scene, PLAN, tmp_path, start=replace(coarse, taylor=None, discrepancy=None))
 
 
+@pytest.mark.slow
 def test_it_resumes_on_the_emulator_it_stands_on(body, coarse, fine, tmp_path):
     """The one kept beside the checkpoint, or the one given; no other."""
     save_emulator(coarse, tmp_path / "coarse")

@@ -15,7 +15,7 @@ from emulator.core.errors import InputError
 from emulator.core.store import check_folder, write_json
 
 if TYPE_CHECKING:
-    from calibrate.posterior.klotz_band import KlotzBand
+    from calibrate.posterior.predictions import KlotzBand
     from calibrate.statistical_model import Model
 
 _OUT = option("--out", "DIR", required=True)
@@ -133,7 +133,7 @@ def _klotz(model: Model, seed: int) -> KlotzBand | None:
     """
     from calibrate.measurements.klotz import klotz_of
     from calibrate.measurements.volume import pressure_volume
-    from calibrate.posterior.klotz_band import klotz_band
+    from calibrate.posterior.predictions import klotz_band
     from emulator.surrogates.fem import FEMForward
 
     if isinstance(model.forward, FEMForward) or (curve := pressure_volume(model.full)) is None:

@@ -50,7 +50,7 @@ def infer(arguments: Namespace) -> Answer:
         raise InputError(
             f"--warmup has no effect with sampler '{sampler.name}', which does not adapt"
         )
-    posterior = infer(problem, folder, force=force, progress=progress)
+    posterior = infer(problem, folder, force=force, check_map=not certify, progress=progress)
     certificate = None
     if certify and not sampler.solves_fem:
         certificate = certify_and_keep(
