@@ -298,7 +298,7 @@ def cases(quick: bool = False) -> list[Case]:
     """Every kind on every problem it makes sense on."""
     found = []
 
-    def add(problems, make, sizes, seeds, *, good_below=-1.0, budget=200):
+    def add(problems, make, sizes, seeds, *, good_below=-np.inf, budget=200):
         for problem in problems:
             for size in sizes:
                 for seed in seeds[:1] if quick else seeds:

@@ -97,6 +97,8 @@ def certify_and_keep(
 ) -> Certificate:
     """Check a posterior against FEM and write ``certificate.json``.
 
+    What FEM says of the map is then said by the posterior's own warnings, too.
+
     Parameters
     ----------
     folder : the folder of the posterior.
@@ -109,6 +111,8 @@ def certify_and_keep(
     simulator = simulator_of(posterior.model.forward.scene, load_steps)
     check = examine(posterior, simulator, **options)
     write_json(Path(folder) / CERTIFICATE, check.certificate.to_json())
+    errors = check.certificate.evidence.map_errors
+    posterior.tree.attrs.update(as_attributes({MAP_ERRORS: errors}))
     remove_pages(Path(folder).resolve())
     if reweight_to is not None and can_reweight(check.certificate):
         save_reweighted(reweighted(check), Path(folder), Path(reweight_to))
