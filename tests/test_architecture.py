@@ -133,3 +133,17 @@ def test_laws_have_values_in_the_one_other_file():
     from law_support import ARGUMENTS
 
     assert ARGUMENTS.keys() == LAWS.keys()
+
+
+def test_no_module_binds_a_name_twice():
+    """The second would silently take the place of the first."""
+    for path in sorted((ROOT / "src").rglob("*.py")):
+        names = []
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                names.append(node.name)
+            elif isinstance(node, ast.Assign | ast.AnnAssign):
+                targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+                inside = [each for target in targets for each in ast.walk(target)]
+                names += [n.id for n in inside if isinstance(n, ast.Name)]
+        assert len(names) == len(set(names)), (path.name, {n for n in names if names.count(n) > 1})

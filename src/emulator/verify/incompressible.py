@@ -29,7 +29,7 @@ from emulator.scenes import Parameter, Scene, Support
 from emulator.scenes.loads import CavityPressure, PublishedPressure, Traction
 from emulator.verify.benchmark import Benchmark, order_of
 
-MU, TRACTION = 422.5, 62.5  # kPa
+COOK_MU, TRACTION = 422.5, 62.5  # kPa
 POINT = (48.0, 52.0)  # mm, middle of the loaded edge
 _COMPRESSIBLE = (
     "14.74 by deal.II Q2 and 14.7273, still rising, by Abaqus CPE4H with 36 864 cells "
@@ -41,7 +41,7 @@ _INCOMPRESSIBLE = (
 )
 _FREE = "does not lock: ten times the bulk modulus changes nothing"
 _LOCKED = "for warning, measured here: linear tetrahedra lock"
-_ORDER = "2.2 measured here; the corner where the clamp ends is a singularity"
+_COOK_ORDER = "2.2 measured here; the corner where the clamp ends is a singularity"
 
 
 def membrane(cells: int, form: Literal["P1", "P2", "mean"]) -> Scene:
@@ -77,7 +77,7 @@ def _parallel_diagonals(cells: int, thickness: float) -> Mesh:
 
 def deflection(membrane: Simulator, nu: float) -> float:
     """Return the vertical displacement of ``POINT`` in mm."""
-    theta = jnp.array([MU, bulk_modulus(MU, nu)])
+    theta = jnp.array([COOK_MU, bulk_modulus(COOK_MU, nu)])
     solution = membrane.solve(theta).require_converged(membrane.scene.name)
     distance = np.linalg.norm(membrane.scene.mesh.nodes[:, :2] - POINT, axis=1)
     return float(solution.displacement[np.argmin(distance), 1])
@@ -99,7 +99,7 @@ def verify_cook() -> list[Benchmark]:
     for nu in (0.499, 0.4999):
         order = order_of(*(deflection(each, nu) for each in mean.values()))
         name = f"Cook, nu {nu:g}, mean dilatation: order of convergence"
-        rows.append((name, order, 2.2, 0.5, _ORDER))
+        rows.append((name, order, 2.2, 0.5, _COOK_ORDER))
     name = "Cook, nu 0.4999, P1 with parallel diagonals: share of the deflection"
     rows.append((name, locked / stiff, 0.36, 0.1, _LOCKED))
     return [Benchmark(*row) for row in rows]
