@@ -24,6 +24,19 @@ PUBLISHED, MEASURED = SHARED / "published", SHARED / "measured"
 CASES = SHARED / "cases"
 
 
+# A compiled program takes some ten memory maps. Linux allows a process 65 530; beyond, XLA crashes.
+MAPS = Path("/proc/self/maps")
+MOST_MAPS = 30_000
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_programs():
+    """Drop compiled programs after a module that leaves the process with too many memory maps."""
+    yield
+    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > MOST_MAPS:
+        jax.clear_caches()
+
+
 @pytest.fixture(scope="session")
 def published() -> Path:
     """Folder of the released data; the test is skipped where it is absent."""
