@@ -73,7 +73,7 @@ def identify(posterior: Posterior) -> dict[str, Any]:
     correlation : first -> second -> correlation, posterior, on the parameters' scales.
     combinations : best known first, each with its ``exponents``, its relative sd ``known_to`` in
         the posterior and ``prior`` in the prior, without parameters whose range is not above 0.
-        Those with a parameter of ``box_ends`` are left out: its range made them narrow.
+        A combination with a parameter of ``box_ends`` is left out: that range made it narrow.
     box_ends : the ends of ranges that end the posterior (:mod:`calibrate.posterior.box`).
     """
     model = posterior.model

@@ -16,13 +16,13 @@ outwards, to :math:`t = -E`, it gives the mass beyond the exit, relative to that
 
 .. math:: M = p(0) \int_0^E e^{\alpha r - \max(\beta, 0)\, r^2}\, dr .
 
-With the masses beyond both exits, and their centres :math:`m_\pm` along :math:`d`, the mean would
-move by
+The masses beyond both exits have their centres :math:`m_\pm` along :math:`d`. In a wider box the
+mean would move by
 
 .. math:: \Delta = \frac{M_+ (m_+ - \bar x) + M_- (m_- - \bar x)}{1 + M_+ + M_-}
 
-in a wider box: :math:`E` is three sd of the draws along :math:`d`, or less where a box that is
-wider by half on each side ends (:meth:`Parameter.wider`). The directions are the axes and the
+where :math:`E` is three sd of the draws along :math:`d`, or less where a box that is wider by half
+on each side ends (:meth:`Parameter.wider`). The directions are the axes and the
 principal axes of the draws. A posterior that is about as wide as the box along :math:`d` is left
 open by the data; it claims nothing there.
 """
@@ -105,7 +105,7 @@ def box_ends(draws: Mapping[str, np.ndarray], box: Mapping[str, Parameter]) -> l
 
 @dataclass(frozen=True)
 class _Exit:
-    """What lies beyond the box along a direction.
+    """The mass that a wider box would hold beyond one exit.
 
     mass : the mass relative to the draws'. beyond : the distance of its centre from their mean.
     ends : the parameters' numbers, and whether it is their upper end, at which draws leave the box.
@@ -156,7 +156,7 @@ def _exit(x: np.ndarray, d: np.ndarray, wider: np.ndarray, farthest: float) -> _
     share = np.bincount(first[near], minlength=len(d)) / near.sum()
     numbers = np.flatnonzero(moves)
     ends = tuple((int(numbers[k]), bool(high[k])) for k in np.flatnonzero(share >= _OFTEN))
-    # From the draws' mean to the exit where they leave, and on to the centre of what is outside.
+    # The exit lies this far from the draws' mean; the centre of what is outside lies further on.
     to_exit = float(((x + t[:, None] * d) @ d)[near].mean() - (x @ d).mean())
     return _Exit(mass, to_exit + float(outside @ r) * T / mass if mass else 0.0, ends)
 

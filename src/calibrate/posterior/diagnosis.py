@@ -46,7 +46,8 @@ _LOWEST_EFFICIENCY = 0.2
 _LOWEST_ACCEPTANCE = 0.1
 _MANY = 100.0
 _MARKED = 0.5  # standard deviations from which a shift of divergences is reported
-# Of a posterior that is the prior: least sd over the prior's, largest difference of probabilities.
+# A posterior counts as the prior if its least sd over the prior's is above the first number, and
+# the largest difference of their distribution functions below the second.
 _LITTLE_SD, _LITTLE_MOVED = 0.8, 0.15
 _NAMED = 3  # largest number of parameters that a sentence names
 

@@ -121,7 +121,7 @@ class Model:
 
     @cached_property
     def on_log_scale(self) -> np.ndarray:
-        """Whether each unknown of theta has a logarithmic scale in its scene, (q,) bool."""
+        """Flags (q,) that say which unknowns of theta have a logarithmic scale in their scene."""
         return np.array([parameter.scale == "log" for parameter in self.parameters], dtype=bool)
 
     def on_scales(self, theta: jax.Array | np.ndarray) -> jax.Array:

@@ -33,7 +33,7 @@ from emulator.scenes.supports.dirichlet import Support, loose_parts
 _METRES = 0.6  # a body smaller than this in all directions is taken to be in m
 _SMALL = 25.0  # a body smaller than this might be in cm
 _MICROMETRES = 3000.0  # a body larger than this in one direction is taken to be in um
-# What names of sets contain, the likeliest first, in words of small letters.
+# Names of sets contain these words, in small letters; the likeliest come first.
 _NO_WALL = r"^(?!.*(endo|epi|cavity|lumen|inner|inside|outer|outside)).*"
 _SUPPORTS = (
     f"{_NO_WALL}base",

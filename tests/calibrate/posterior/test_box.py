@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.special import erf
 
 import calibrate as cal
 from calibrate.posterior.box import box_ends, in_words
@@ -34,6 +35,17 @@ def test_a_normal_that_is_cut_near_its_mode_ends_there(inside, at_high):
     # The whole normal's mean against the cut one's; far outside only a lower bound is told.
     exact = (2.0 - 0.05 * inside - draws.mean()) / draws.std()
     assert end.shift == pytest.approx(min(exact, 3.0), rel=0.4)
+
+
+def test_the_shift_of_half_a_normal_is_the_integral():
+    """Continued by three sd of the draws, M and its centre have closed forms."""
+    (end,) = one(normal(2.0, 0.05, count=20_000))
+    sd = np.sqrt(1.0 - 2.0 / np.pi)  # of half a normal of sd 1, whose mean is sqrt(2 / pi)
+    far = 3.0 * sd
+    mass = erf(far / np.sqrt(2.0))
+    centre = np.sqrt(2.0 / np.pi) * (1.0 - np.exp(-0.5 * far**2)) / mass
+    shift = mass * (centre + np.sqrt(2.0 / np.pi)) / (1.0 + mass)
+    assert end.shift == pytest.approx(shift / sd, rel=0.06)
 
 
 @pytest.mark.parametrize("seed", range(5))
