@@ -14,7 +14,7 @@ OLDEST_TESTS := tests/test_package.py $(addprefix tests/emulator/,mechanics scen
 	training test_schema.py test_store.py) $(addprefix tests/calibrate/,samplers certificate cli/test_cli.py \
 	analysis/sensitivity report posterior/test_tree.py measurements/test_data.py project/test_demo.py)
 
-.PHONY: demo test test-slow test-oldest package notebooks pictures docs lint format study clean
+.PHONY: demo test test-slow test-studies test-oldest package notebooks pictures docs lint format study clean
 
 demo: $(STAMP)
 	@$(BIN)/calibrate demo --out $(OUT)
@@ -24,7 +24,11 @@ test: $(STAMP)
 	JAX_DISABLE_MOST_OPTIMIZATIONS=1 $(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile --durations=20
 
 test-slow: $(STAMP)
-	$(BIN)/python -m pytest -m slow
+	$(BIN)/python -m pytest -m slow -n 2 --dist loadfile --durations=20 \
+		--ignore=tests/test_studies.py --ignore=tests/test_notebooks.py
+
+test-studies: $(STAMP)
+	$(BIN)/python -m pytest -m slow --durations=40 tests/test_studies.py
 
 # Warnings are shown, not errors: old libraries announce what new ones did.
 test-oldest: $(OLDEST)/.installed

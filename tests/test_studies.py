@@ -1,4 +1,4 @@
-"""Studies run from a clean clone with one command; here on a few cases.
+"""Studies run from a clean clone with one command, which asserts its claims; here on a few cases.
 
 A new study is its folder and a line in ``QUICK``; ``CHECKS`` may say more of its results.
 """
@@ -57,7 +57,6 @@ QUICK = {
     "verification": "--quick",
     "transfer": "--quick --one --family 2 --pretrain 6 --steps 3 --longest 4 --runs 3 --tests 2",
 }
-FAST: tuple[str, ...] = ()
 
 
 def run(name: str, *words: object) -> dict:
@@ -101,9 +100,8 @@ def _given(word: str, given: dict[str, str]) -> str:
     return f"{given.get(first, first)}{slash}{rest}"
 
 
-@pytest.mark.parametrize(
-    "name", [n if n in FAST else pytest.param(n, marks=pytest.mark.slow) for n in QUICK]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", QUICK)
 def test_a_few_cases(name, tmp_path, request):
     given = {"ABSENT": str(tmp_path / "absent")}
     for folder in ("PUBLISHED", "MEASURED"):
@@ -192,26 +190,6 @@ def test_cases_that_are_there_are_not_repeated(tmp_path, monkeypatch):
     Results(tmp_path, 0, settings={"n": 2}).case("a", case("a"))
     Results(tmp_path, 0, settings={"n": 2}, again=True).case("a", case("a"))
     assert made == ["a", "b", "a", "a"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", ["accuracy_vs_time", "decoder_speed", "error_bar", "few_runs", "stability"]
-)
-def test_in_full(name, tmp_path):
-    run(name, "--out", tmp_path)  # asserts its own claims
-
-
-@pytest.mark.slow
-def test_fem_speed_in_full(tmp_path, published):
-    run("fem_speed", "--published", published, "--out", tmp_path)  # asserts its own claims
-
-
-@pytest.mark.slow
-def test_beam_coverage_in_full(tmp_path, published):
-    results = run("beam_coverage", published, "--out", tmp_path)
-    assert results["summary"]["accepted"] >= 48
-    assert all(40 <= hits <= 50 for hits in results["summary"]["covered"].values())
 
 
 def test_the_stress_of_a_strip_of_muscle_is_the_slope_of_its_energy():
