@@ -132,3 +132,22 @@ class LinearSimulator:
 
     def sensitivities(self, u, theta):
         return jnp.moveaxis(jax.jacfwd(self.forward)(theta), -1, 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Even(LinearForward):
+    """A forward map that is even in mu about 75: theta and its mirror image predict the same."""
+
+    def __call__(self, theta):
+        return jnp.ones((len(self.nodes), 3)) * ((theta[0] - 75.0) / 10.0) ** 2
+
+
+def share_and_evidence():
+    """Share of the upper mode, and log evidence, of the model with two modes."""
+    mu = np.linspace(30.0, 120.0, 900_001)
+    z = (1.0 - ((mu - 75.0) / 10.0) ** 2) / 0.1
+    height = 3 * (-0.5 * z**2 - np.log(0.1 * np.sqrt(2 * np.pi)))
+    height += -0.5 * ((mu - 73.0) / 9.0) ** 2 - np.log(9.0 * np.sqrt(2 * np.pi))
+    density = np.exp(height)
+    total = density.sum() * (mu[1] - mu[0])
+    return density[mu > 75].sum() * (mu[1] - mu[0]) / total, np.log(total)

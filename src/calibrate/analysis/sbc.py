@@ -193,7 +193,7 @@ def sbc(
     *,
     truth: Model | None = None,
     draws: int = 99,
-    sampler: str = "nuts",
+    sampler: str | None = None,
     options: Any | None = None,
     seed: int = 0,
     progress: bool = False,

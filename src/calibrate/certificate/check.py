@@ -31,7 +31,7 @@ from threadpoolctl import threadpool_limits
 
 from calibrate.certificate.estimates import Tests, evidence_of
 from calibrate.certificate.mesh import MOST_RUNS, mesh_change
-from calibrate.certificate.pool import MOST_TEMPERED, Kernels, Pool, key_from, tempered
+from calibrate.certificate.pool import Pool
 from calibrate.certificate.predictive import Predictive
 from calibrate.certificate.runs import Runs, Solver, correction_from, descend
 from calibrate.certificate.verdict import Certificate, judge
@@ -41,6 +41,7 @@ from calibrate.posterior.posterior import make_tree
 from calibrate.samplers import SAMPLERS
 from calibrate.samplers.diagnostics import effective, normalised
 from calibrate.samplers.laplace import MISSED_AT, MISSED_BY
+from calibrate.samplers.proposals import MOST_TEMPERED, Kernels, key_from, tempered
 from calibrate.statistical_model import FEMLikelihood
 from emulator.core.display import counting
 from emulator.core.errors import InputError, check_arguments

@@ -33,7 +33,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import logsumexp
 
-from calibrate.certificate.pool import Pool, key_from
+from calibrate.certificate.pool import Pool
 from calibrate.certificate.predictive import Correction, Predictive
 from calibrate.certificate.runs import Runs, least_likely
 from calibrate.certificate.verdict import (
@@ -47,6 +47,7 @@ from calibrate.certificate.verdict import (
 from calibrate.posterior import Posterior
 from calibrate.posterior.diagnosis import Misfit, Sampling, places_of
 from calibrate.samplers.diagnostics import effective, normalised, pareto_shape
+from calibrate.samplers.proposals import key_from
 from calibrate.statistical_model.errors import in_noise_sd
 
 GROUPS = 25

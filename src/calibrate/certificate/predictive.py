@@ -41,7 +41,15 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from scipy.linalg import cho_factor, cho_solve
 
-from calibrate.samplers.density import Density, density_of
+from calibrate.samplers.density import (
+    BATCH,
+    Density,
+    density_of,
+    finite_coordinates,
+    in_blocks,
+    prior_draws,
+    without_nan,
+)
 from calibrate.statistical_model import Data, Model
 from emulator.core.gaussian_process import squared_exponential
 
@@ -49,9 +57,6 @@ _LENGTHS = (0.25, 0.5, 1.0, 2.0, 4.0)  # correlation lengths that are compared, 
 _NUGGETS = (1e-6, 1e-4, 1e-2, 1.0, 1e2)
 _TREND = 1e2
 _NEGLIGIBLE = 1e-3  # leave-one-out error, in noise sd, that changes no posterior
-_BLOCK = 256  # points evaluated by one call of a program, so that it is compiled for one shape
-_BATCH = 32  # points of a block that are vectorised
-_FARTHEST = 40.0  # |z| at which a bounded parameter is its bound in double precision
 _WIDTH_DRAWS = 512  # draws of the prior, from which the scale of theta's features is taken
 
 
@@ -175,7 +180,7 @@ class Predictive:
 
     def constrain(self, z: np.ndarray) -> dict[str, np.ndarray]:
         """Return draws by name, each (s,)."""
-        return self._in_blocks(self._density.constrain, z)
+        return in_blocks(self._density.constrain, z)
 
     def columns(self, z: np.ndarray) -> np.ndarray:
         """Return draws (s, p) of the model's unknowns, in the order of their names."""
@@ -185,15 +190,15 @@ class Predictive:
     def unconstrain(self, draws: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return z (s, p) of draws by name; a draw on a bound of its parameter is moved inside."""
         named = {name: jnp.asarray(draws[name]) for name in self.model.names}
-        return _finite_coordinates(jax.jit(jax.vmap(self._density.unconstrain))(named))
+        return finite_coordinates(jax.jit(jax.vmap(self._density.unconstrain))(named))
 
     def prior_draws(self, rng_key: jax.Array, count: int) -> np.ndarray:
         """Return points (count, p) drawn from the prior."""
-        return _finite_coordinates(self._prior_draws(jax.random.split(rng_key, count)))
+        return prior_draws(self._density, rng_key, count)
 
     def by_map(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return ``prior``, ``cheap`` and ``means`` of :class:`Evaluated` at points (s, p)."""
-        return self._in_blocks(self._map_block, z)
+        return in_blocks(self._map_block, z)
 
     def evaluate(self, z: np.ndarray, correction: Correction) -> Evaluated:
         """Return log densities at points (s, p)."""
@@ -205,7 +210,7 @@ class Predictive:
     def evaluate_again(self, z: np.ndarray, at: Evaluated, correction: Correction) -> Evaluated:
         """Return ``at``, of ``z`` (s, p), under another correction; the map is not asked again."""
         program = partial(self._correction_block, correction)
-        corrected, variance = self._in_blocks(program, z, at.means)
+        corrected, variance = in_blocks(program, z, at.means)
         return at._replace(corrected=corrected, variance=variance)
 
     def means(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -302,10 +307,10 @@ class Predictive:
             means, valid = self.model.predict(draws)
             cheap = self.model.map_log_likelihood(draws, self.data)
             flat = jnp.where(valid, ravel_pytree(means)[0], jnp.nan)
-            cheap = _without_nan(jnp.where(valid, cheap, -jnp.inf))
-            return _without_nan(self._density.log_prior(z)), cheap, flat
+            cheap = without_nan(jnp.where(valid, cheap, -jnp.inf))
+            return without_nan(self._density.log_prior(z)), cheap, flat
 
-        return jax.lax.map(one, z, batch_size=_BATCH)
+        return jax.lax.map(one, z, batch_size=BATCH)
 
     @_compiled
     def _correction_block(self, correction: Correction, z: jax.Array, means: jax.Array) -> Any:
@@ -313,29 +318,6 @@ class Predictive:
             draws = self._constrain(point[0])
             step, variance = correct(correction, self._features(draws))
             means = self.by_name(point[1] + step)
-            return _without_nan(self.model.fem_log_likelihood(draws, means, self.data)), variance
+            return without_nan(self.model.fem_log_likelihood(draws, means, self.data)), variance
 
-        return jax.lax.map(one, (z, means), batch_size=_BATCH)
-
-    @_compiled
-    def _prior_draws(self, keys: jax.Array) -> jax.Array:
-        return jax.vmap(self._density.prior_draw)(keys)
-
-    def _in_blocks(self, program: Any, *points: np.ndarray) -> Any:
-        """Return ``program`` of arrays (s, ...), called with padded blocks of one shape."""
-        count = len(points[0])
-        padded = [np.concatenate([x, np.repeat(x[-1:], -count % _BLOCK, axis=0)]) for x in points]
-        parts = [
-            jax.tree.map(np.asarray, program(*(jnp.asarray(x[k : k + _BLOCK]) for x in padded)))
-            for k in range(0, len(padded[0]), _BLOCK)
-        ]
-        return jax.tree.map(lambda *arrays: np.concatenate(arrays)[:count], *parts)
-
-
-def _without_nan(log_density: jax.Array) -> jax.Array:
-    return jnp.where(jnp.isfinite(log_density), log_density, -jnp.inf)
-
-
-def _finite_coordinates(z: jax.Array) -> np.ndarray:
-    """Return ``z`` with finite coordinates; a draw on a bound is at infinity."""
-    return np.clip(np.nan_to_num(np.asarray(z), posinf=1e9, neginf=-1e9), -_FARTHEST, _FARTHEST)
+        return jax.lax.map(one, (z, means), batch_size=BATCH)

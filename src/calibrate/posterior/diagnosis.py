@@ -41,7 +41,6 @@ LARGEST_MAP_ERROR = 0.5  # noise sd by which the forward map may miss FEM's data
 LARGEST_DIVERGENT = 0.002
 MAP_FIRST = "mend the map first"  # the remedy of chains on a wrong map
 _FEWEST = 200  # replicates from which a small p, or a share of the prior's sd, can be estimated
-_LARGEST_K = 0.7  # Vehtari et al. (2024)
 _LOWEST_EFFICIENCY = 0.2
 _LOWEST_ACCEPTANCE = 0.1
 _MANY = 100.0
@@ -197,11 +196,17 @@ def diagnose(
             "here; train it longer, or use forward map 'corrected'"
         )
     k, efficiency = attributes.get("pareto_k", 0.0), attributes.get("importance_efficiency", 1.0)
-    if not (k <= _LARGEST_K and efficiency >= _LOWEST_EFFICIENCY):
+    if not (k <= limits.LARGEST_PARETO_SHAPE and efficiency >= _LOWEST_EFFICIENCY):
         yield (
-            f"the Gaussian approximation is poor, Pareto k {k:.2f} (at most {_LARGEST_K}) and "
-            f"{100.0 * efficiency:.2g} % of the draws effective (at least "
+            f"the Gaussian approximation is poor, Pareto k {k:.2f} (at most "
+            f"{limits.LARGEST_PARETO_SHAPE}) and {100.0 * efficiency:.2g} % of the draws effective "
+            "(at least "
             f"{100.0 * _LOWEST_EFFICIENCY:.0f} %): use a sampler, such as nuts"
+        )
+    if (k := attributes.get("weights_pareto_k", 0.0)) > limits.LARGEST_PARETO_SHAPE:
+        yield (
+            f"the weights of importance sampling have a heavy tail, Pareto k {k:.2f} (at most "
+            f"{limits.LARGEST_PARETO_SHAPE}): use another sampler, such as nuts"
         )
     place, lighter = attributes.get(MISSED_AT), attributes.get(MISSED_BY)
     if place is not None and lighter is not None:

@@ -205,7 +205,7 @@ def sample(
     model: Model,
     data: np.ndarray | Mapping[str, np.ndarray],
     *,
-    sampler: str = "nuts",
+    sampler: str | None = None,
     options: Any | None = None,
     seed: int = 0,
     progress: bool = False,
@@ -218,7 +218,9 @@ def sample(
     With several observations, ``data`` maps their names to values: displacements (d, 3) in mm, a
     volume in mL. Missing values are NaN and left out. ``sampler`` is a name of
     :data:`calibrate.samplers.SAMPLERS`; ``options`` is an instance of that sampler's options,
-    ``None`` for its defaults.
+    ``None`` for its defaults. Without a name the sampler is that of the options, or ``auto``:
+    importance sampling for up to eight unknowns, where its own diagnosis says that it works, and
+    NUTS elsewhere.
 
     Parameters
     ----------
@@ -234,7 +236,7 @@ def sample(
         or of which all values are missing, a sampler that needs a simulator and has none, a
         checkpoint of another run.
     """
-    method = find_sampler(sampler)
+    method = find_sampler(sampler, options)
     options = check_options(method, options)
     model, checked = model.given(data)
     if simulator is None and method.solves_fem:
@@ -243,7 +245,7 @@ def sample(
             "posterior's scene"
         )
     fem = None if simulator is None else FEMLikelihood(model, simulator)
-    record = provenance(model, seed, sampler, options)
+    record = provenance(model, seed, method.name, options)
     # The scene's place is no matter. Messages name the first difference, so what a user changes
     # most comes first.
     first = {name: record[name] for name in ("sampler", "seed", "sampler_options")}

@@ -35,6 +35,7 @@ from calibrate.project.results import (
 )
 from calibrate.project.run import Run
 from calibrate.samplers import find_sampler
+from calibrate.samplers.auto import AUTO
 from calibrate.samplers.nuts import NUTS
 from calibrate.statistical_model import Model
 from emulator.core import schema
@@ -214,7 +215,7 @@ def _sample_together(
 ) -> Hierarchy:
     """Sample all members by NUTS; the first one's run says for how long and with which seed."""
     run, shared = next(iter(plan.members.values())), plan.population
-    own_options = run.sampler_options if run.sampler == NUTS.name else {}
+    own_options = run.sampler_options if run.sampler in (AUTO.name, NUTS.name) else {}
     by_nuts = replace(
         run, sampler=NUTS.name, sampler_options={"target_accept": TARGET_ACCEPT, **own_options}
     )

@@ -103,7 +103,7 @@ class Run:
     error_runs: int = 0
     mesh_error_runs: int = 0
     load_steps: int = 1
-    sampler: str = "nuts"
+    sampler: str = "auto"
     sampler_options: dict[str, Any] = field(default_factory=dict)
     warmup: int = 500
     draws: int = 1000

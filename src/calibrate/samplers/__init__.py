@@ -4,10 +4,12 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
+from calibrate.samplers.auto import AUTO, AutoOptions
 from calibrate.samplers.chains import ChainSampler
 from calibrate.samplers.delayed_acceptance import DELAYED_ACCEPTANCE, DelayedAcceptanceOptions
 from calibrate.samplers.density import Density, density_of, named_draws
 from calibrate.samplers.diagnostics import r_hat
+from calibrate.samplers.importance import IMPORTANCE, ImportanceOptions
 from calibrate.samplers.laplace import LAPLACE, LaplaceOptions
 from calibrate.samplers.mclmc import MCLMC, MCLMCOptions
 from calibrate.samplers.nuts import BLACKJAX_NUTS, NUTS, BlackJAXNUTSOptions, NUTSOptions
@@ -16,11 +18,14 @@ from calibrate.samplers.smc import SMC, SMCOptions
 from emulator.core.errors import InputError, look_up
 from emulator.core.schema import Source, parse, table_of
 
-_ALL: tuple[Sampler, ...] = (NUTS, BLACKJAX_NUTS, MCLMC, DELAYED_ACCEPTANCE, SMC, LAPLACE)
+_ALL: tuple[Sampler, ...] = (
+    AUTO, IMPORTANCE, NUTS, BLACKJAX_NUTS, MCLMC, DELAYED_ACCEPTANCE, SMC, LAPLACE,
+)  # fmt: skip
 SAMPLERS: dict[str, Sampler] = {sampler.name: sampler for sampler in _ALL}
 
 __all__ = [
     "SAMPLERS",
+    "AutoOptions",
     "BlackJAXNUTSOptions",
     "ChainOptions",
     "ChainSampler",
@@ -28,6 +33,7 @@ __all__ = [
     "DelayedAcceptanceOptions",
     "Density",
     "Draws",
+    "ImportanceOptions",
     "Kernel",
     "LaplaceOptions",
     "MCLMCOptions",
@@ -43,8 +49,17 @@ __all__ = [
 ]
 
 
-def find_sampler(name: str) -> Sampler:
-    """Return the sampler of that name; :class:`InputError` names the known ones."""
+def find_sampler(name: str | None, options: Any | None = None) -> Sampler:
+    """Return the sampler of that name; by default that of the options, or ``auto``.
+
+    Raises
+    ------
+    InputError
+        An unknown name; the known ones are given.
+    """
+    if name is None:
+        own = (sampler for sampler in _ALL if sampler.options is type(options))
+        return next(own, AUTO)
     return look_up(SAMPLERS, name, "sampler")
 
 

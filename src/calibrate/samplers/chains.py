@@ -28,8 +28,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibrate.samplers.density import Target
-from calibrate.samplers.diagnostics import converged
-from calibrate.samplers.protocol import PATHFINDER, ChainOptions, Context, Draws, Kernel, Sampler
+from calibrate.samplers.protocol import (
+    PATHFINDER,
+    ChainOptions,
+    Context,
+    Draws,
+    Kernel,
+    Sampler,
+    in_rounds,
+)
 from calibrate.samplers.transport import (
     StandardMap,
     apply_standard,
@@ -80,15 +87,6 @@ class ChainSampler(Sampler):
         with chains.bar:
             chains.begin(jax.random.key(context.seed))
             return in_rounds(chains.draw, options)
-
-
-def in_rounds(draw: Callable[[int], Draws], options: ChainOptions) -> Draws:
-    """Return ``draw`` of a total number of draws, which rises until the chains agree."""
-    for rounds in range(1, options.rounds + 1):
-        draws = draw(rounds * options.draws)
-        if converged(draws.z, options.r_hat, options.ess):
-            break
-    return draws
 
 
 class Programs:

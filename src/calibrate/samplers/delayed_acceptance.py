@@ -31,10 +31,10 @@ import numpy as np
 from tqdm import tqdm
 
 from calibrate.samplers import transport
-from calibrate.samplers.chains import Chains, compile_chains, in_rounds, join
+from calibrate.samplers.chains import Chains, compile_chains, join
 from calibrate.samplers.density import Density, tempered
 from calibrate.samplers.nuts import BLACKJAX_NUTS, BlackJAXNUTSOptions
-from calibrate.samplers.protocol import ChainOptions, Context, Draws, Sampler
+from calibrate.samplers.protocol import ChainOptions, Context, Draws, Sampler, in_rounds
 from calibrate.statistical_model import Data
 from emulator.core.display import counting
 from emulator.core.errors import InputError, SolverError

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,8 +22,13 @@ from numpyro.infer.util import potential_energy
 from calibrate.statistical_model import Data, Model
 from emulator.core.machine import cores
 from emulator.fem.campaign import at_once
+from emulator.surrogates.corrected import CorrectedForward
 from emulator.surrogates.fem import FEMForward
 from emulator.surrogates.protocol import ForwardMap
+
+_BLOCK = 256  # points evaluated by one call of a program, so that it is compiled for one shape
+BATCH = 32  # points of a block that are vectorised
+_FARTHEST = 40.0  # |z| at which a bounded parameter is its bound in double precision
 
 
 @dataclass(frozen=True)
@@ -52,6 +57,7 @@ class Density(Target):
     constrain : (z (s, p),) -> draws by name, each (s,).
     unconstrain : (draw by name, each ()) -> z (p,).
     names : the names of the coordinates, (p,), in their order.
+    batches : whether many evaluations at once are cheap, as they are where none solves FEM.
     """
 
     log_prior: Callable[[jax.Array], jax.Array]
@@ -60,6 +66,7 @@ class Density(Target):
     constrain: Callable[[jax.Array], dict[str, jax.Array]]
     unconstrain: Callable[[Mapping[str, jax.Array]], jax.Array]
     names: tuple[str, ...]
+    batches: bool = True
 
 
 @lru_cache(maxsize=4)
@@ -110,12 +117,69 @@ def density_of(model: Model) -> Density:
         constrain=jax.jit(jax.vmap(draw)),
         unconstrain=unconstrain,
         names=names,
+        batches=not isinstance(model.forward, FEMForward | CorrectedForward),
     )
 
 
 def threads_for(forward: ForwardMap) -> int:
     """Return the number of evaluations at once: one a core, fewer where FEM needs the memory."""
     return at_once(forward.simulator) if isinstance(forward, FEMForward) else cores()
+
+
+class Heights(NamedTuple):
+    """Log densities at points, each (s,), ``-inf`` where the density is zero.
+
+    prior : the prior density of z, its Jacobian included. likelihood : the likelihood.
+    """
+
+    prior: Any
+    likelihood: Any
+
+
+def heights(density: Density, z: np.ndarray, data: Data) -> Heights:
+    """Return the log densities at points z (s, p); the program is compiled once a density."""
+    program = _height_program(density)
+    return in_blocks(lambda block: program(block, data), z)
+
+
+@lru_cache(maxsize=4)
+def _height_program(density: Density) -> Callable[..., Heights]:
+    def one(z: jax.Array, data: Data) -> Heights:
+        prior, likelihood = density.log_prior(z), density.log_likelihood(z, data)
+        return Heights(without_nan(prior), without_nan(likelihood))
+
+    return jax.jit(lambda z, data: jax.lax.map(lambda row: one(row, data), z, batch_size=BATCH))
+
+
+@lru_cache(maxsize=4)
+def _prior_program(density: Density) -> Callable[..., jax.Array]:
+    return jax.jit(jax.vmap(density.prior_draw))
+
+
+def prior_draws(density: Density, rng_key: jax.Array, count: int) -> np.ndarray:
+    """Return points z (count, p) drawn from the prior."""
+    return finite_coordinates(_prior_program(density)(jax.random.split(rng_key, count)))
+
+
+def in_blocks(program: Callable[..., Any], *points: np.ndarray) -> Any:
+    """Return ``program`` of arrays (s, ...), called with padded blocks of one shape."""
+    count = len(points[0])
+    padded = [np.concatenate([x, np.repeat(x[-1:], -count % _BLOCK, axis=0)]) for x in points]
+    parts = [
+        jax.tree.map(np.asarray, program(*(jnp.asarray(x[k : k + _BLOCK]) for x in padded)))
+        for k in range(0, len(padded[0]), _BLOCK)
+    ]
+    return jax.tree.map(lambda *arrays: np.concatenate(arrays)[:count], *parts)
+
+
+def without_nan(log_density: jax.Array) -> jax.Array:
+    """Return ``log_density``, ``-inf`` where it is not finite."""
+    return jnp.where(jnp.isfinite(log_density), log_density, -jnp.inf)
+
+
+def finite_coordinates(z: jax.Array) -> np.ndarray:
+    """Return ``z`` with finite coordinates; a draw on a bound is at infinity."""
+    return np.clip(np.nan_to_num(np.asarray(z), posinf=1e9, neginf=-1e9), -_FARTHEST, _FARTHEST)
 
 
 @lru_cache(maxsize=4)

@@ -17,6 +17,7 @@ WARN_ABOVE_R_HAT = 1.01  # Vehtari et al. (2021)
 REFUSE_ABOVE_R_HAT = 1.05  # the chains are draws of different posteriors
 ENOUGH_ESS = 400.0  # Vehtari et al. (2021); a run goes on until it has them
 REFUSE_BELOW_ESS = 100.0
+LARGEST_PARETO_SHAPE = 0.7  # Vehtari et al. (2024): beyond, means of weighted points are not known
 FEWEST_WEIGHTS = 25  # weights whose largest fifth has a tail to fit
 
 _AXES = {"chain_axis": 0, "draw_axis": 1}

@@ -2,7 +2,8 @@
 
 Samplers that are Markov chains give a :class:`Kernel` and options that extend
 :class:`ChainOptions`, and leave the rest to :class:`~calibrate.samplers.chains.ChainSampler`; a
-sampler of another kind (particles, an approximation) implements :meth:`Sampler.sample` itself.
+sampler of another kind (weighted points, an approximation) implements :meth:`Sampler.sample`
+itself.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 
 from calibrate.samplers.checkpoint import Checkpoint
-from calibrate.samplers.diagnostics import ENOUGH_ESS, RUN_UNTIL_R_HAT
+from calibrate.samplers.diagnostics import ENOUGH_ESS, RUN_UNTIL_R_HAT, converged
 from calibrate.statistical_model import FEMLikelihood
 from emulator.core.errors import InputError
 
@@ -73,6 +74,18 @@ class Sampler(ABC):
     @abstractmethod
     def sample(self, density: Any, data: Any, options: Any, context: Context) -> Draws:
         """Draw from ``density`` given ``data``."""
+
+
+def in_rounds(draw: Callable[[int], Draws], options: Any) -> Draws:
+    """Return ``draw`` of a total number of draws, which rises until chains or populations agree.
+
+    options : options with ``draws``, ``rounds``, ``r_hat`` and ``ess``.
+    """
+    for rounds in range(1, options.rounds + 1):
+        draws = draw(rounds * options.draws)
+        if converged(draws.z, options.r_hat, options.ess):
+            break
+    return draws
 
 
 class Kernel(NamedTuple):
@@ -140,6 +153,10 @@ class Options:
                 raise InputError(f"{self.label}: {field.name} is {value}; it must be 1 or more")
             if field.name in self.shares and not 0.0 < value < 1.0:
                 raise InputError(f"{self.label}: {field.name} is {value}; give one in (0, 1)")
+            if field.name == "r_hat" and not value > 1.0:
+                raise InputError(f"{self.label}: r_hat is {value}; it must be above 1")
+            if field.name == "ess" and not value >= 0.0:
+                raise InputError(f"{self.label}: ess is {value}; it must be 0 or more")
 
 
 @dataclass(frozen=True)
@@ -171,7 +188,3 @@ class ChainOptions(Options):
             raise InputError(
                 f"{self.label}: start is '{self.start}'; it is {RANDOM} or {PATHFINDER}"
             )
-        if not self.r_hat > 1.0:
-            raise InputError(f"{self.label}: r_hat is {self.r_hat}; it must be above 1")
-        if not self.ess >= 0.0:
-            raise InputError(f"{self.label}: ess is {self.ess}; it must be 0 or more")

@@ -4,10 +4,11 @@ import jax
 import numpy as np
 import pytest
 
-from calibrate.certificate.pool import Kernels, Pool, tempered
+from calibrate.certificate.pool import Pool
 from calibrate.certificate.predictive import Predictive, no_correction
 from calibrate.samplers import density_of, transport
 from calibrate.samplers.diagnostics import effective, normalised
+from calibrate.samplers.proposals import Kernels, tempered
 from certificate_support import exact_data, exact_posterior, grid_of, linear_model, quadrature
 
 

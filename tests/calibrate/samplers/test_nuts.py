@@ -135,7 +135,7 @@ def test_a_bent_posterior_is_sampled_well(beam):
     forward = linear_forward(beam, of=Bent)
     model = cal.model(forward, cal.nodal_displacements(beam, [3, 4, 5]), cal.GaussianNoise(sd=1e-3))
     data = np.asarray(forward.at(np.array([3, 4, 5]))(jnp.array([70.0, 70.0])))
-    posterior = cal.sample(model, data)
+    posterior = cal.sample(model, data, sampler="nuts")
     table = posterior.summary()
     assert min(row["ess_bulk"] for row in table.values()) > 1000
     assert max(row["r_hat"] for row in table.values()) < 1.01

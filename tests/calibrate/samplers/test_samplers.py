@@ -69,10 +69,10 @@ def test_one_chain_stops_and_has_an_r_hat(problem):
 
 def test_an_unknown_sampler_and_options_of_another_are_refused(problem):
     model, data = problem
-    with pytest.raises(InputError, match="sampler 'hmc' is unknown; known: nuts, blackjax_nuts"):
+    with pytest.raises(InputError, match="sampler 'hmc' is unknown; known: auto, importance, nuts"):
         cal.sample(model, data, sampler="hmc")
     with pytest.raises(InputError, match="'nuts' takes NUTSOptions, not BlackJAXNUTSOptions"):
-        cal.sample(model, data, options=BlackJAXNUTSOptions())
+        cal.sample(model, data, sampler="nuts", options=BlackJAXNUTSOptions())
 
 
 @pytest.mark.parametrize("bad", [{"rounds": 0}, {"r_hat": 1.0}, {"ess": -1.0}])

@@ -1,6 +1,6 @@
 """Tempered SMC: several modes, and the evidence, against closed forms and quadrature."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -13,42 +13,13 @@ import calibrate as cal
 from calibrate.samplers import SMCOptions, density_of
 from calibrate.samplers.smc import _increment, evidence
 from emulator.core.errors import InputError, SolverError
-from linear_support import PRIOR_MEAN, PRIOR_SD, LinearForward, linear_forward, linear_problem
-
-
-@dataclass(frozen=True, eq=False)
-class Even(LinearForward):
-    """A forward map that is even in mu about 75: theta and its mirror image predict the same."""
-
-    def __call__(self, theta):
-        return jnp.ones((len(self.nodes), 3)) * ((theta[0] - 75.0) / 10.0) ** 2
-
-
-@pytest.fixture(scope="module")
-def two_modes(beam):
-    """Modes at mu = 65 and 85, each 0.3 wide; the prior favours the lower one."""
-    forward = linear_forward(beam, of=Even)
-    prior = {"mu": dist.Normal(73.0, 9.0), "lam": dist.Normal(75.0, 8.0)}
-    observe = cal.nodal_displacements(beam, [3])
-    model = cal.model(forward, observe, cal.GaussianNoise(sd=0.1), prior, check_scale=False)
-    return model, np.ones((1, 3))
-
-
-def by_quadrature():
-    """Share of the upper mode, and log evidence, of the model with two modes."""
-    mu = np.linspace(30.0, 120.0, 900_001)
-    z = (1.0 - ((mu - 75.0) / 10.0) ** 2) / 0.1
-    height = 3 * (-0.5 * z**2 - np.log(0.1 * np.sqrt(2 * np.pi)))
-    height += -0.5 * ((mu - 73.0) / 9.0) ** 2 - np.log(9.0 * np.sqrt(2 * np.pi))
-    density = np.exp(height)
-    total = density.sum() * (mu[1] - mu[0])
-    return density[mu > 75].sum() * (mu[1] - mu[0]) / total, np.log(total)
+from linear_support import PRIOR_MEAN, PRIOR_SD, linear_forward, linear_problem, share_and_evidence
 
 
 @pytest.mark.slow
 def test_two_modes_that_nuts_gets_wrong_have_their_shares(two_modes):
     model, data = two_modes
-    share, log_evidence = by_quadrature()
+    share, log_evidence = share_and_evidence()
     assert share == pytest.approx(0.38, abs=0.01)
     posterior = cal.sample(model, data, sampler="smc", seed=1)
     upper = (posterior.tree["posterior"]["mu"].values > 75).mean(axis=1)

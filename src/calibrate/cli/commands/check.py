@@ -47,7 +47,7 @@ def _sbc(arguments: Namespace) -> Answer:
     from calibrate.figures.sensitivity import draw_calibration
     from calibrate.posterior.predictions import shortfall
     from calibrate.project import by_fem, model_before_data
-    from calibrate.samplers import NUTSOptions
+    from calibrate.samplers import AutoOptions
 
     folder, progress = check_folder(arguments.out), not arguments.json
     if arguments.scheduler is not None and not arguments.fem_data:
@@ -60,7 +60,7 @@ def _sbc(arguments: Namespace) -> Answer:
         truth = model_before_data(problem.change(noise=noise_words(arguments.true_noise)))
     if arguments.fem_data:
         truth = by_fem(truth, run.load_steps)
-    options = NUTSOptions(arguments.warmup, arguments.draws, arguments.chains, rounds=1)
+    options = AutoOptions(arguments.warmup, arguments.draws, arguments.chains, rounds=1)
     calibration = sbc(
         model,
         arguments.replicates,

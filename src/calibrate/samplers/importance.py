@@ -1,0 +1,234 @@
+r"""Adaptive importance sampling: few unknowns, and a forward map that is fast in batches.
+
+A population begins with draws of the prior, so that it sees all of it, and moves to the posterior
+by the steps of :mod:`calibrate.samplers.proposals`. Then a proposal :math:`q`, kernels around its
+points, is fitted, twice or more, and fresh points of the last one, drawn after it was chosen, are
+weighted,
+
+.. math:: w_i = \frac{p(z_i)\, L(z_i)}{q(z_i)}
+
+until they are worth the draws asked for: :math:`(\sum w_i)^2 / \sum w_i^2` of them. The draws are
+resampled from these points with probability proportional to :math:`w_i`; equal ones occur. Every
+weight is of the model's own density, so nothing is approximated but by the number of points. The
+mean of the weights is the evidence.
+
+Independent populations take the place of chains: their R-hat shows whether they found the same
+posterior. Where they did not, because a mode is hard to find, each is fitted once more to the
+weighted points of all. The Pareto shape of the weights' tail (Vehtari et al. 2024) shows whether
+the proposal covers it.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+from scipy.special import logsumexp
+
+from calibrate.samplers.density import Density, Heights, heights, prior_draws
+from calibrate.samplers.diagnostics import (
+    ENOUGH_ESS,
+    RUN_UNTIL_R_HAT,
+    converged,
+    normalised,
+    pareto_shape,
+)
+from calibrate.samplers.proposals import (
+    STEP,
+    Kernels,
+    WeightedPoints,
+    effective_number,
+    key_from,
+    resampled,
+)
+from calibrate.samplers.protocol import Context, Draws, Options, Sampler, in_rounds
+from calibrate.samplers.smc import evidence
+from calibrate.statistical_model import Data
+from emulator.core.display import counting
+from emulator.core.errors import SolverError
+
+_PRIOR = 1024  # draws of the prior that a population begins with
+_FOUND = 200.0  # effective points from which a proposal is fitted
+_FITS, _MOST_FITS = 2, 6
+_LIGHT = 0.5  # Pareto shape of the weights of a good fit: their variance is finite
+_FITTED_TO = 4096  # points, resampled, that a proposal is fitted to
+_FRESH = 2048  # points at a time from a fitted proposal
+_CENTRES, _WIDTHS, _FREEDOM = 512, (0.5, 1.0), 5.0  # of a fitted proposal
+
+
+@dataclass(frozen=True)
+class ImportanceOptions(Options):
+    """Size of a run.
+
+    draws : the number of draws of a population, in a round.
+    chains : the number of independent populations.
+    rounds : the largest number of rounds; another one begins while R-hat or ESS miss their limits.
+    r_hat, ess : the largest R-hat, and smallest bulk and tail ESS of any parameter, to stop at.
+    evaluations : the largest number of evaluations of the density by a population.
+    """
+
+    draws: int = 1000
+    chains: int = 4
+    rounds: int = 8
+    r_hat: float = RUN_UNTIL_R_HAT
+    ess: float = ENOUGH_ESS
+    evaluations: int = 100_000
+
+    label: ClassVar[str] = "importance"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Population(WeightedPoints):
+    """Weighted points of one population."""
+
+    density: Density
+    data: Data
+
+    @classmethod
+    def of_prior(cls, density: Density, data: Data, rng: np.random.Generator) -> Population:
+        """Return draws of the prior."""
+        z = prior_draws(density, key_from(rng), _PRIOR)
+        return cls(
+            z=z, at=heights(density, z, data), priors=_PRIOR, log_kernels=np.zeros((0, _PRIOR)),
+            density=density, data=data,
+        )  # fmt: skip
+
+    def densities(self, z: np.ndarray) -> Heights:
+        """Return log prior and log likelihood at points z (s, p)."""
+        return heights(self.density, z, self.data)
+
+    @property
+    def log_posterior(self) -> np.ndarray:
+        """Log posterior density (s,) at the points, up to the evidence."""
+        return self.at.prior + self.at.likelihood
+
+    @property
+    def log_weights(self) -> np.ndarray:
+        """Log weights (s,) of the posterior."""
+        return self.log_posterior - self.log_mixture
+
+    @property
+    def log_evidence(self) -> float:
+        """Logarithm of the mean weight."""
+        return float(logsumexp(self.log_weights) - np.log(len(self.z)))
+
+    def refitted(
+        self, z: np.ndarray, log_weights: np.ndarray, rng: np.random.Generator
+    ) -> Population:
+        """Return fresh points from kernels around weighted points z (s, p)."""
+        rows = rng.choice(len(z), size=_FITTED_TO, p=normalised(log_weights))
+        proposal = Kernels.around(z[rows], _WIDTHS, _FREEDOM, rng, centres=_CENTRES)
+        none = replace(
+            self, z=self.z[:0], at=Heights(*(values[:0] for values in self.at)), priors=0,
+            proposals=(), counts=(), log_kernels=np.zeros((0, 0)),
+        )  # fmt: skip
+        return none.extended(proposal, _FRESH, rng)
+
+    def grown(self, rng: np.random.Generator) -> Population:
+        """Return the points with more of their one proposal."""
+        z = self.proposals[0].sample(rng, _FRESH)
+        points = self.with_points(z)
+        return replace(points, counts=(self.counts[0] + len(z),))
+
+
+class _Run:
+    """One population: its generator, its points, and how many evaluations they took."""
+
+    def __init__(
+        self, density: Density, data: Data, options: ImportanceOptions, seed: list[int]
+    ) -> None:
+        self._options, self._rng = options, np.random.default_rng(seed)
+        self.evaluations = _PRIOR
+        self.points = Population.of_prior(density, data, self._rng)
+        if not np.isfinite(self.points.log_weights).any():
+            raise SolverError("the posterior density is zero at every draw of the prior")
+        while True:  # one step at least: proposals are better than the prior
+            self._go_to(self.points.stepped(self.points.log_weights, self._rng), STEP)
+            if effective_number(self.points.log_weights) >= _FOUND:
+                break
+        for fits in range(1, _MOST_FITS + 1):
+            self.fit(self.points.z, self.points.log_weights)
+            if fits >= _FITS and pareto_shape(self.points.log_weights) < _LIGHT:
+                break
+
+    def fit(self, z: np.ndarray, log_weights: np.ndarray) -> None:
+        """Go to fresh points from kernels around weighted points z (s, p)."""
+        self._go_to(self.points.refitted(z, log_weights, self._rng), _FRESH)
+
+    def draw(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return draws z (count, p) and their log posterior densities (count,)."""
+        while effective_number(self.points.log_weights) < count:
+            self._go_to(self.points.grown(self._rng), _FRESH)
+        rows = resampled(normalised(self.points.log_weights), count, self._rng)
+        return self.points.z[rows], self.points.log_posterior[rows]
+
+    def _go_to(self, points: Population, evaluations: int) -> None:
+        """Take the points, which took so many evaluations more."""
+        self.points, self.evaluations = points, self.evaluations + evaluations
+        if self.evaluations > self._options.evaluations:
+            worth = effective_number(points.log_weights)
+            raise SolverError(
+                f"importance: the points of a population are worth {worth:.0f} draws after "
+                f"{self.evaluations} evaluations; use nuts or smc, or allow more evaluations"
+            )
+
+
+def _of_all(runs: list[_Run]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points z (s, p) of all populations and their log weights (s,)."""
+    populations = [run.points for run in runs]
+    log_weights = [points.log_weights - np.log(len(points.z)) for points in populations]
+    return np.concatenate([points.z for points in populations]), np.concatenate(log_weights)
+
+
+class ImportanceSampling(Sampler):
+    """The sampler of adaptive importance sampling."""
+
+    def sample(
+        self, density: Density, data: Data, options: ImportanceOptions, context: Context
+    ) -> Draws:
+        """Return draws resampled from the weighted points of independent populations.
+
+        The attribute ``log_evidence`` is the logarithm of the populations' mean evidence,
+        ``log_evidence_error`` its standard error, ``weights_pareto_k`` the largest Pareto shape of
+        a population's weights, ``evaluations`` those of the density in all.
+
+        Raises
+        ------
+        SolverError
+            The density is zero wherever the prior was drawn, or a population did not come to the
+            posterior within ``options.evaluations``.
+        """
+        seeds = [[context.seed, k] for k in range(options.chains)]
+        with (
+            counting(desc=self.name, total=options.chains, disable=not context.progress) as bar,
+            ThreadPoolExecutor(min(density.at_once, options.chains)) as pool,
+        ):
+
+            def begin(seed: list[int]) -> _Run:
+                run = _Run(density, data, options, seed)
+                bar.update()
+                return run
+
+            runs = list(pool.map(begin, seeds))
+
+            def draw(total: int) -> Draws:
+                z, lp = zip(*pool.map(lambda run: run.draw(total), runs), strict=True)
+                return Draws(np.stack(z), {"lp": np.stack(lp)})
+
+            draws = draw(options.draws)
+            if not converged(draws.z, options.r_hat, options.ess):
+                z, log_weights = _of_all(runs)
+                list(pool.map(lambda run: run.fit(z, log_weights), runs))
+                draws = in_rounds(draw, options)
+        shapes = [pareto_shape(run.points.log_weights) for run in runs]
+        attributes: dict[str, Any] = {
+            "weights_pareto_k": float(np.max(shapes)),
+            "evaluations": int(sum(run.evaluations for run in runs)),
+            **evidence(np.array([run.points.log_evidence for run in runs])),
+        }
+        return draws._replace(attributes=attributes)
+
+
+IMPORTANCE = ImportanceSampling("importance", ImportanceOptions, ("lp",))

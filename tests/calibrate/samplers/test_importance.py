@@ -1,0 +1,204 @@
+"""Importance sampling against closed forms and quadrature, and when it is chosen by default."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.scipy.stats import norm
+
+import calibrate as cal
+from calibrate.posterior.diagnosis import diagnose
+from calibrate.samplers import Density, ImportanceOptions, density_of, find_sampler
+from calibrate.samplers.auto import AUTO, SAMPLED_BY, AutoOptions
+from calibrate.samplers.importance import IMPORTANCE
+from calibrate.samplers.proposals import Kernels, separate
+from calibrate.samplers.protocol import Context
+from emulator.core.errors import InputError, SolverError
+from emulator.surrogates.fem import fem_forward
+from linear_support import LinearForward, linear_forward, linear_problem, share_and_evidence
+
+SD = 4.0  # of the prior of ``density``
+
+
+def density(log_likelihood, size, **more):
+    """A normal prior of sd 4 in each coordinate, and a likelihood."""
+    prior = lambda z: norm.logpdf(z, 0.0, SD).sum()
+    likelihood = lambda z, data: log_likelihood(z)
+    return Density(
+        lambda z, data: prior(z) + log_likelihood(z), size, size > 1, 2, prior, likelihood,
+        lambda key: SD * jax.random.normal(key, (size,)),
+        lambda z: {f"z{i}": z[:, i] for i in range(size)},
+        lambda draw: jnp.stack(list(draw.values())),
+        tuple(f"z{i}" for i in range(size)), **more,
+    )  # fmt: skip
+
+
+def sampled(of, seed=0, **options):
+    return IMPORTANCE.sample(of, {}, ImportanceOptions(**options), Context(seed))
+
+
+def test_two_modes_that_nuts_gets_wrong_have_their_shares(two_modes):
+    model, data = two_modes
+    share, log_evidence = share_and_evidence()
+    posterior = cal.sample(model, data, seed=1, predictions=False)
+    attributes = posterior.tree.attrs
+    assert attributes[SAMPLED_BY] == "importance"
+    upper = (posterior.tree["posterior"]["mu"].values > 75).mean(axis=1)
+    np.testing.assert_allclose(upper, share, atol=6 * np.sqrt(share * (1 - share) / 1000))
+    assert posterior.summary()["mu"]["r_hat"] < 1.01
+    assert attributes["log_evidence"] == pytest.approx(log_evidence, abs=0.05)
+    assert 0.0 < attributes["log_evidence_error"] < 0.05
+    assert posterior.warnings() == []
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_narrow_modes_far_apart_in_five_dimensions(seed):
+    """Shares 0.3 and 0.7, sds a hundredth of the prior's, in correlated coordinates."""
+    root = np.linalg.cholesky(0.04**2 * (0.5 * np.eye(5) + 0.5))
+    whiten = jnp.asarray(np.linalg.inv(root))
+    centres = jnp.array([[-3.0, 1.0, 0.0, 2.0, -1.0], [2.0, -2.0, 1.0, 0.0, 3.0]])
+    # The prior weights the modes, too.
+    weights = jnp.log(jnp.array([0.3, 0.7])) - norm.logpdf(centres, 0.0, SD).sum(axis=1)
+    log_det = np.log(np.diag(root)).sum()
+
+    def log_likelihood(z):
+        each = norm.logpdf((z - centres) @ whiten.T).sum(axis=1) - log_det
+        return jax.nn.logsumexp(each + weights)
+
+    draws = sampled(density(log_likelihood, 5), seed)
+    first = draws.z[..., 0] < 0.0
+    np.testing.assert_allclose(first.mean(axis=1), 0.3, atol=5 * np.sqrt(0.21 / 1000))
+    # Of a normal prior the evidence of narrow Gaussians is about their prior's mean density.
+    assert draws.attributes["log_evidence"] == pytest.approx(0.0, abs=0.05)
+    white = (draws.z[first] - np.asarray(centres[0])) @ np.asarray(whiten).T
+    np.testing.assert_allclose(white.std(axis=0), 1.0, atol=0.12)
+    assert draws.attributes["weights_pareto_k"] < 0.7
+
+
+def test_a_sheet_that_is_bent_and_cut_by_the_box(beam):
+    """mu known to a thousandth along a curve across the whole box of lam, by quadrature."""
+
+    class Bent(LinearForward):
+        def __call__(self, theta):
+            mu, lam = theta[0], theta[1]
+            value = mu * (3 * lam + 2 * mu) / (lam + mu)
+            return jnp.ones((len(self.nodes), 3)) * value / 200.0
+
+    forward = linear_forward(beam, of=Bent)
+    model = cal.model(forward, cal.nodal_displacements(beam, [3, 4, 5]), cal.GaussianNoise(sd=1e-3))
+    data = np.asarray(forward.at(np.array([3, 4, 5]))(jnp.array([70.0, 70.0])))
+    posterior = cal.sample(model, data, predictions=False)
+    assert posterior.tree.attrs[SAMPLED_BY] == "importance"
+    mu, lam = np.meshgrid(np.linspace(67.0, 73.0, 12_001), np.linspace(50.0, 100.0, 401))
+    value = mu * (3 * lam + 2 * mu) / (lam + mu) / 200.0
+    weights = np.exp(-0.5 * 9 * ((value - data[0, 0]) / 1e-3) ** 2) / (mu * lam)
+    weights /= weights.sum()
+    for name, grid in (("mu", mu), ("lam", lam)):
+        mean = (weights * grid).sum()
+        sd = np.sqrt((weights * (grid - mean) ** 2).sum())
+        draws = posterior.draws()[name]
+        assert abs(draws.mean() - mean) < 4 * sd / np.sqrt(4000)
+        assert draws.std() == pytest.approx(sd, rel=0.05)
+
+
+def test_the_same_seed_gives_the_same_draws_whatever_the_threads(beam):
+    model, data = linear_problem(beam)
+    model, checked = model.given(data)
+    of = density_of(model)
+    options = ImportanceOptions(draws=100)
+    one, two = (
+        IMPORTANCE.sample(replace(of, at_once=count), checked, options, Context(3)).z
+        for count in (1, 4)
+    )
+    np.testing.assert_array_equal(one, two)
+    other = IMPORTANCE.sample(of, checked, options, Context(4)).z
+    assert not np.array_equal(one, other)
+
+
+def test_nuts_is_taken_where_importance_sampling_does_not_work(beam, simulator, monkeypatch):
+    """Where its evaluations do not suffice, its weights are heavy, or the map is not fast."""
+    model, data = linear_problem(beam)
+    short = AutoOptions(200, 200, rounds=1)
+
+    def sampler_of(model, **more):
+        posterior = cal.sample(model, data, options=short, predictions=False, **more)
+        return posterior.tree.attrs[SAMPLED_BY]
+
+    assert sampler_of(model) == "importance"
+    asked = []
+    monkeypatch.setattr("calibrate.samplers.auto.IMPORTANCE", Refusing(asked))
+    assert sampler_of(model) == "nuts"
+    assert len(asked) == 1
+    assert not density_of.__wrapped__(replace(model, forward=fem_forward(simulator))).batches
+    of = replace(density_of(model.given(data)[0]), batches=False)
+    AUTO.sample(of, model.given(data)[1], short, Context())
+    assert len(asked) == 1
+
+
+class Refusing:
+    """Importance sampling that gives up."""
+
+    name, options = "importance", ImportanceOptions
+
+    def __init__(self, asked):
+        self.asked = asked
+
+    def sample(self, *arguments):
+        self.asked.append(arguments)
+        raise SolverError("importance: refused")
+
+
+def test_what_cannot_work_is_named():
+    with pytest.raises(SolverError, match="zero at every draw of the prior"):
+        sampled(density(lambda z: -jnp.inf, 2))
+    needle = density(lambda z: norm.logpdf(z, 1.0, 1e-3).sum(), 4)
+    with pytest.raises(SolverError, match=r"worth \d+ draws after 30\d\d evaluations; use nuts"):
+        sampled(needle, evaluations=3000)
+    with pytest.raises(InputError, match="importance: r_hat is 1.0; it must be above 1"):
+        ImportanceOptions(r_hat=1.0)
+    draws = {"z": np.random.default_rng(0).normal(size=(4, 500))}
+    row = {"z": {"r_hat": 1.0, "ess_bulk": 2000.0, "ess_tail": 2000.0}}
+    assert list(diagnose(draws, {}, row, {"weights_pareto_k": 0.5})) == []
+    (sentence,) = diagnose(draws, {}, row, {"weights_pareto_k": 0.9})
+    assert sentence.startswith("the weights of importance sampling have a heavy tail")
+
+
+def test_points_where_the_map_has_no_answer_are_left_out():
+    """A half-space of density zero, through the middle of the posterior."""
+    of = density(lambda z: jnp.where(z[0] > 0.0, norm.logpdf(z, 0.0, 0.5).sum(), jnp.nan), 3)
+    draws = sampled(of)
+    assert (draws.z[..., 0] > 0.0).all()
+    sd = (0.5**-2 + SD**-2) ** -0.5
+    assert draws.z[..., 0].mean() == pytest.approx(sd * np.sqrt(2 / np.pi), rel=0.05)
+
+
+def test_the_sampler_is_that_of_the_options():
+    assert find_sampler(None).name == "auto"
+    assert find_sampler(None, cal.NUTSOptions()).name == "nuts"
+    assert find_sampler(None, ImportanceOptions()).name == "importance"
+    assert find_sampler("smc", cal.NUTSOptions()).name == "smc"
+
+
+def test_points_in_separate_places_have_a_covariance_each():
+    rng = np.random.default_rng(0)
+    shift = np.where(rng.uniform(size=(900, 1)) < 0.3, -5.0, 5.0)
+    z = shift + np.array([1.0, 0.1]) * rng.normal(size=(900, 2))
+    parts = separate(z)
+    assert sorted(len(rows) for rows in parts) == sorted([(shift < 0).sum(), (shift > 0).sum()])
+    kernels = Kernels.around(z, (0.5, 1.0), 5.0, rng)
+    assert len(kernels.groups) == 2
+    axis = np.linspace(-12.0, 12.0, 401)
+    grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
+    mass = np.exp(kernels.log_density(grid)) * 0.06**2
+    assert mass.sum() == pytest.approx(1.0, abs=0.01)
+    drawn = kernels.sample(rng, 4000)
+    assert np.mean(drawn[:, 0] < 0) == pytest.approx(mass[grid[:, 0] < 0].sum(), abs=0.03)
+
+
+@pytest.mark.parametrize("kind", ["gaussian", "uniform", "logistic"])
+def test_points_of_one_place_are_not_parted(kind):
+    rng = np.random.default_rng(0)
+    draw = {"gaussian": rng.normal, "uniform": rng.uniform, "logistic": rng.logistic}[kind]
+    assert len(separate(draw(size=(1000, 5)))) == 1
