@@ -1,4 +1,4 @@
-r"""A check of a posterior against FEM with a fixed number of solves.
+r"""A check of a posterior against FEM, with as many solves as decide.
 
 1. **Train.** FEM is solved at draws of the posterior, evenly spaced, around them, at draws of the
    prior, and along descents of its own misfit (:mod:`calibrate.certificate.runs`). A correction of
@@ -16,6 +16,11 @@ r"""A check of a posterior against FEM with a fixed number of solves.
 
 Given the training runs, the tests are independent draws from a known density: the errors are honest
 however good or bad the correction is, and small where it is good.
+
+3. **Decide.** The check begins with 70 runs. While they leave the verdict undecided there are twice
+   as many, up to 200: the earlier ones train, and fresh points test. A figure is compared with its
+   limit at each look, with an error wide enough for five looks
+   (:mod:`calibrate.certificate.verdict`).
 """
 
 from __future__ import annotations
@@ -48,7 +53,7 @@ from emulator.core.errors import InputError, check_arguments
 from emulator.fem import Simulator
 from emulator.fem.campaign import executor
 
-_FEM_RUNS = 200
+_BEGIN, _AT_MOST = 70, 200  # FEM runs by default
 _FEWEST = 25
 # Shares of the runs that train the correction; the others test it.
 _AT_DRAWS, _AROUND, _AT_PRIOR, _DESCENTS, _ADAPTIVE = 0.15, 0.1, 0.1, 0.08, 0.12
@@ -91,10 +96,11 @@ def examine(
     scheduler: str | None = None,
     progress: bool = False,
 ) -> Check:
-    """Check ``posterior`` with ``draws`` FEM runs, 200 by default.
+    """Check ``posterior`` with FEM runs: 70, doubled up to 200 while the verdict is undecided.
 
     Parameters
     ----------
+    draws : the number of runs to begin with; alone, the number of runs.
     at_most : the number of runs up to which they are doubled while the verdict is undecided.
     mesh : the number of solves on the next finer mesh (:mod:`calibrate.certificate.mesh`): 0 for
         none, up to 15; by default four more than there are unknowns.
@@ -152,7 +158,7 @@ def examine(
 
 
 def certify(posterior: Posterior, simulator: Simulator, **options: Any) -> Certificate:
-    """Return the certificate of :func:`examine`: ``posterior`` against ``draws`` FEM runs (200).
+    """Return the certificate of :func:`examine`: ``posterior`` against FEM.
 
     ``options`` are those of :func:`examine`.
     """
@@ -162,12 +168,12 @@ def certify(posterior: Posterior, simulator: Simulator, **options: Any) -> Certi
 
 def _checked_counts(draws: int | None, at_most: int | None, mesh: int | None) -> tuple[int, int]:
     """Return the numbers of FEM runs, to begin with and at most."""
-    count = _FEM_RUNS if draws is None else draws
+    most = (_AT_MOST if draws is None else draws) if at_most is None else at_most
+    count = min(_BEGIN, most) if draws is None else draws
     if count < _FEWEST:
         raise InputError(f"certify: {count} FEM runs asked for; give {_FEWEST} or more")
     if mesh is not None and not 0 <= mesh <= MOST_RUNS:
         raise InputError(f"certify: {mesh} solves on the finer mesh; give 0 to {MOST_RUNS}")
-    most = count if at_most is None else at_most
     if most < count:
         raise InputError(f"certify: at most {most} FEM runs, but {count} to begin with")
     return count, most

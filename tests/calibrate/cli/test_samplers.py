@@ -62,7 +62,7 @@ def test_delayed_acceptance_goes_on_after_a_kill(capsys, monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["leapfrogs=3"], "sampler 'nuts': unknown key 'leapfrogs'; known: chains, draws"),
+        (["leapfrogs=3"], "sampler 'auto': unknown key 'leapfrogs'; known: chains, draws"),
         (["rounds=2.5"], "sampler 'nuts': rounds = 2.5; expected a whole number"),
         (["target_accept"], "--sampler-options: 'target_accept' is not NAME=VALUE"),
         (["target_accept=2"], "NUTS: target_accept is 2; give one in (0, 1)"),

@@ -115,7 +115,7 @@ MISTAKES = [
     ),
     (
         ("draws = 40", "sampler_options = {jump = 2}"),
-        "sampler 'nuts': unknown key 'jump'; known:",
+        "sampler 'auto': unknown key 'jump'; known:",
     ),
     (("draws = 40", "truth = {mu = 60.0}"), "truth has no effect beside data file"),
     (("[noise]", "[population]\neta = 1.0\n[noise]"), "[population] is of members; give [member"),

@@ -62,11 +62,15 @@ def infer(arguments: Namespace) -> Answer:
 
 
 def _add_solves(parser: ArgumentParser) -> None:
-    parser.add_argument("--draws", type=int, help="FEM runs (default 200)")
+    parser.add_argument(
+        "--draws",
+        type=int,
+        help="FEM runs (default: 70, doubled up to 200 while the verdict is undecided)",
+    )
     parser.add_argument(
         "--until",
         choices=["decided"],
-        help="while the verdict is undecided, double the FEM runs, up to --at-most",
+        help="while the verdict is undecided, double the FEM runs up to --at-most",
     )
     parser.add_argument(
         "--at-most", type=int, metavar="N", help="FEM runs altogether (default 1000)"
