@@ -40,7 +40,7 @@ class Case:
     seed: int
     make: Callable[..., Any]
     good: bool = False
-    budget: int = 200
+    budget: int | None = None
 
     @property
     def sampled(self):
@@ -50,7 +50,7 @@ class Case:
 
     @property
     def name(self):
-        runs = "" if self.budget == 200 else f", {self.budget} runs"
+        runs = "" if self.budget is None else f", {self.budget} runs"
         return f"{self.problem}, {self.kind} {self.size:g}, seed {self.seed}{runs}"
 
 
@@ -298,7 +298,7 @@ def cases(quick: bool = False) -> list[Case]:
     """Every kind on every problem it makes sense on."""
     found = []
 
-    def add(problems, make, sizes, seeds, *, good_below=-np.inf, budget=200):
+    def add(problems, make, sizes, seeds, *, good_below=-np.inf, budget=None):
         for problem in problems:
             for size in sizes:
                 for seed in seeds[:1] if quick else seeds:

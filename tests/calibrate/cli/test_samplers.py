@@ -63,9 +63,9 @@ def test_delayed_acceptance_goes_on_after_a_kill(capsys, monkeypatch, tmp_path):
     ("words", "message"),
     [
         (["leapfrogs=3"], "sampler 'auto': unknown key 'leapfrogs'; known: chains, draws"),
-        (["rounds=2.5"], "sampler 'nuts': rounds = 2.5; expected a whole number"),
+        (["rounds=2.5"], "sampler 'auto': rounds = 2.5; expected a whole number"),
         (["target_accept"], "--sampler-options: 'target_accept' is not NAME=VALUE"),
-        (["target_accept=2"], "NUTS: target_accept is 2; give one in (0, 1)"),
+        (["target_accept=2"], "auto: target_accept is 2; give one in (0, 1)"),
     ],
 )
 def test_options_that_cannot_be(words, message, capsys, tmp_path):
