@@ -4,9 +4,12 @@ FEM is solved at a few points of the posterior, on its mesh and on the next fine
 (:mod:`emulator.accuracy.mesh_error`). The difference :math:`D` in the data varies little over a
 posterior, and a Gaussian process of theta continues it (:mod:`calibrate.certificate.predictive`).
 Added to the map's error on the mesh, it gives a posterior under the finer mesh's FEM, and the pool
-follows that posterior; half of the points lie in it. The change is from the corrected posterior to
-this one, over the same points of the pool. Its error is the jackknife's over the solves on the
-finer mesh, and over the pool.
+follows that posterior. The change is from the corrected posterior to this one, over the same points
+of the pool. Its error is the jackknife's over the solves on the finer mesh, and over the pool.
+
+Solves on the finer mesh are dear. The first four points lie in the corrected posterior; where they
+leave no doubt, with twice the margin, there are no others. Otherwise more follow, in the posterior
+under the finer mesh's FEM as it is known by then.
 """
 
 from __future__ import annotations
@@ -41,6 +44,7 @@ from emulator.fem.campaign import at_once, in_order
 
 MOST_RUNS = 15
 _FEWEST = 4  # least number of points at which both meshes are solved
+_MARGIN = 2.0  # factor between a figure and its limit at which few points decide
 _ROUNDS = 12  # steps of the pool towards a posterior that may be many sd away
 
 Differences = Callable[[np.ndarray], Iterable[np.ndarray | None]]
@@ -93,15 +97,16 @@ def mesh_change(
     solves = points * states
     with counting(total=solves, desc="finer mesh", disable=not progress, unit="solve") as bar:
         differences = _differences_of_fem(predictive, error, observe, bar)
-        change = change_by(differences, pool, runs, points, rng)
+        model_error = predictive.model.error
+        widened = model_error is not None and model_error.of_mesh
+        change = change_by(differences, pool, runs, points, rng, widened=widened)
     error.forget()
-    model_error = predictive.model.error
     return replace(
         change,
-        runs=solves,
+        runs=change.runs * states,
+        failed=change.failed * states,
         nodes=len(error.finer.scene.mesh.nodes),
         linear=simulator.scene.mesh.order == 1,
-        widened=model_error is not None and model_error.of_mesh,
     )
 
 
@@ -143,22 +148,64 @@ def _differences_of_fem(
 
 
 def change_by(
-    differences: Differences, pool: Pool, runs: Runs, count: int, rng: np.random.Generator
+    differences: Differences,
+    pool: Pool,
+    runs: Runs,
+    most: int,
+    rng: np.random.Generator,
+    *,
+    widened: bool = False,
 ) -> MeshChange:
-    """Return the changes of the corrected posterior by ``differences`` at ``count`` points."""
-    predictive, names = pool.predictive, pool.predictive.model.names
-    correction_by = _corrections_by(predictive, runs)
-    z, D = _at_draws(differences, pool, -(-count // 2), rng)
-    fine = pool.corrected_by(correction_by(z, D)).polished(rng, _ROUNDS, cheap=False)
-    more_z, more_D = _at_draws(differences, fine, count // 2, rng)
-    z, D = np.concatenate([z, more_z]), np.concatenate([D, more_D])
-    failed = count - len(z)
-    if len(z) < _FEWEST:
-        return MeshChange(runs=count, failed=failed)
-    fine = fine.corrected_by(correction_by(z, D)).polished(rng, _ROUNDS, cheap=False)
+    """Return the changes of the corrected posterior by ``differences`` at a few points.
+
+    most : the largest number of points.
+    widened : whether the likelihood allows for the error of the mesh.
+    """
+    correction_by = _corrections_by(pool.predictive, runs)
+    z, D = _at_draws(differences, pool, min(_FEWEST, most), rng)
+    asked, fine = min(_FEWEST, most), pool
+    while True:
+        change = MeshChange(runs=asked, failed=asked - len(z), widened=widened)
+        if len(z) >= _FEWEST:
+            fine = fine.corrected_by(correction_by(z, D)).polished(rng, _ROUNDS, cheap=False)
+            value, error = _change(fine, correction_by, z, D)
+            names, p = pool.predictive.model.names, len(pool.predictive.model.names)
+            figures = as_figures(value, error)
+            change = replace(
+                change,
+                shift=dict(zip(names, figures[:p], strict=True)),
+                log_sd=dict(zip(names, figures[p:], strict=True)),
+            )
+        if asked >= most or _leaves_no_doubt(change):
+            return change
+        more = -(-(most - asked) // 2)
+        more_z, more_D = _at_draws(differences, fine, more, rng)
+        asked, z, D = asked + more, np.concatenate([z, more_z]), np.concatenate([D, more_D])
+
+
+def _leaves_no_doubt(change: MeshChange) -> bool:
+    """Return whether all figures are far within their limits, or one is far beyond."""
+    figures = change.comparisons()
+    far_within = [figure.within(limit / _MARGIN) is True for _, figure, limit in figures]
+    far_beyond = [figure.within(limit * _MARGIN) is False for _, figure, limit in figures]
+    return bool(figures) and (all(far_within) or any(far_beyond))
+
+
+def _change(
+    fine: Pool,
+    correction_by: Callable[[np.ndarray, np.ndarray], Correction],
+    z: np.ndarray,
+    D: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return changes of means, in sd, and of log sds, (2 p,), and their errors.
+
+    fine : the pool under the correction to the finer mesh's FEM.
+    z, D : the points (k, p) at which both meshes were solved, and the differences (k, m).
+    """
     # The corrected posterior on the mesh, over the same points.
     before = fine.corrected_by(correction_by(z[:0], D[:0])).corrected
-    x, p = predictive.columns(fine.z), len(names)
+    x = fine.predictive.columns(fine.z)
+    p = x.shape[1]
 
     def change(after: np.ndarray, used: np.ndarray | float = 1.0) -> np.ndarray:
         old, new = moments(x, before * used), moments(x, after * used)
@@ -170,14 +217,7 @@ def change_by(
         for remaining in ~np.eye(len(z), dtype=bool)
     ]
     variance = np.sum((np.array(leave_one_out) - value) ** 2, axis=0) * (len(z) - 1) / len(z)
-    error = np.hypot(error, np.sqrt(variance))
-    figures = as_figures(value, error)
-    return MeshChange(
-        dict(zip(names, figures[:p], strict=True)),
-        dict(zip(names, figures[p:], strict=True)),
-        runs=count,
-        failed=failed,
-    )
+    return value, np.hypot(error, np.sqrt(variance))
 
 
 def _corrections_by(

@@ -29,7 +29,7 @@ from typing import Any, NamedTuple, Self
 
 import jax
 import numpy as np
-from scipy.cluster.vq import kmeans2
+from scipy.cluster.vq import ClusterError, kmeans2
 from scipy.optimize import brentq
 from scipy.special import gammaln, logsumexp
 
@@ -184,12 +184,16 @@ def _halved(z: np.ndarray) -> np.ndarray | None:
     """Return which of the points z (s, p) are in the first of two separate places, if they are."""
     covariance, fewest = np.atleast_2d(np.cov(z, rowvar=False)), 4 * (z.shape[1] + 1)
     values, vectors = np.linalg.eigh(covariance)
-    if len(z) < 2 * fewest or not values[0] > 0.0:
+    # Of coordinates that do not vary, round-off would decide.
+    if len(z) < 2 * fewest or not values[0] > 1e-12 * values[-1]:
         return None
     white = (z - z.mean(axis=0)) @ (vectors / np.sqrt(values))
     best, halves, whole = _SEPARATE, None, np.log(values).sum()
     for axis in np.eye(z.shape[1]):
-        _, label = kmeans2(white, np.stack([-axis, axis]), minit="matrix")
+        try:
+            _, label = kmeans2(white, np.stack([-axis, axis]), minit="matrix", missing="raise")
+        except ClusterError:  # one of the two is empty
+            continue
         first = label == 0
         if min(first.sum(), (~first).sum()) < fewest:
             continue

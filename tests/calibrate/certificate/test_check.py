@@ -220,7 +220,7 @@ def test_failed_fem_runs_count(beam, fem, data):
     """Nowhere, or where half of the posterior is."""
     posterior = exact_posterior(linear_model(beam, forward=fem), data)
     nowhere = cal.certify(posterior, LinearSimulator(replace(fem, limit=0.0)))
-    assert (nowhere.verdict, nowhere.evidence.physics.failed) == ("not certified", 200)
+    assert (nowhere.verdict, nowhere.evidence.physics.failed) == ("not certified", 70)
     half = replace(fem, limit=exact_moments(fem, data)[0][0])
     partly = cal.certify(posterior, LinearSimulator(half))
     assert partly.verdict == "not certified"
