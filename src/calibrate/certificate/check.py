@@ -48,7 +48,7 @@ from calibrate.samplers.diagnostics import effective, normalised
 from calibrate.samplers.laplace import MISSED_AT, MISSED_BY
 from calibrate.samplers.proposals import MOST_TEMPERED, Kernels, key_from, tempered
 from calibrate.statistical_model import FEMLikelihood
-from emulator.core.display import counting
+from emulator.core.display import Stages, counting
 from emulator.core.errors import InputError, check_arguments
 from emulator.fem import Simulator
 from emulator.fem.campaign import executor
@@ -95,6 +95,7 @@ def examine(
     seed: int = 0,
     scheduler: str | None = None,
     progress: bool = False,
+    stages: Stages | None = None,
 ) -> Check:
     """Check ``posterior`` with FEM runs: 70, doubled up to 200 while the verdict is undecided.
 
@@ -105,6 +106,7 @@ def examine(
     mesh : the number of solves on the next finer mesh (:mod:`calibrate.certificate.mesh`): 0 for
         none, up to 15; by default four more than there are unknowns.
     scheduler : the address of a Dask scheduler whose workers solve; by default this process does.
+    stages : takes the seconds of each stage.
 
     Raises
     ------
@@ -118,6 +120,7 @@ def examine(
             f"the posterior of sampler '{sampler}' is FEM's already; it needs no certificate"
         )
     count, most = _checked_counts(draws, at_most, mesh)
+    stages = Stages(show=False) if stages is None else stages
     predictive = Predictive(posterior.model, posterior.data)
     rng = np.random.default_rng(seed)
     z = predictive.unconstrain(posterior.draws())
@@ -128,32 +131,35 @@ def examine(
         counting(total=count, desc="FEM check", disable=not progress, unit="run") as bar,
     ):
         solver = Solver(predictive, FEMLikelihood(posterior.model, simulator, execute), bar)
-        rows = np.linspace(0, len(z) - 1, max(round(_AT_DRAWS * count), 5)).astype(int)
-        at_draws = solver(z[rows], stability=_STABILITY)
-        # Next to the draws the map may hide a part of the posterior, by an error that draws of the
-        # prior are too far apart to show.
-        surroundings = Kernels.surrounding(z, rng).sample(rng, max(round(_AROUND * count), 4))
-        around = solver(surroundings)
-        prior = predictive.prior_draws(key_from(rng), max(round(_AT_PRIOR * count), 4))
-        at_prior = solver(prior, slopes=True)
-        # Only descents of FEM's own misfit lead to a mode that the map hides altogether.
-        descending = max(round(_DESCENTS * count), min(_FEWEST_DESCENTS, count // 6))
-        descents, modes = descend(solver, at_prior, at_draws, z, descending, rng)
+        with stages("FEM where the map was asked"):
+            rows = np.linspace(0, len(z) - 1, max(round(_AT_DRAWS * count), 5)).astype(int)
+            at_draws = solver(z[rows], stability=_STABILITY)
+            # Next to the draws the map may hide a part of the posterior, by an error that draws of
+            # the prior are too far apart to show.
+            surroundings = Kernels.surrounding(z, rng).sample(rng, max(round(_AROUND * count), 4))
+            around = solver(surroundings)
+            prior = predictive.prior_draws(key_from(rng), max(round(_AT_PRIOR * count), 4))
+            at_prior = solver(prior, slopes=True)
+            # Only descents of FEM's own misfit lead to a mode that the map hides altogether.
+            descending = max(round(_DESCENTS * count), min(_FEWEST_DESCENTS, count // 6))
+            descents, modes = descend(solver, at_prior, at_draws, z, descending, rng)
         training, total = Runs.joined([at_draws, around, at_prior, descents]), count
-        while True:
-            training, pool = _train(solver, z, training, modes, count, most, rng)
-            rows, log_drawn = pool.tests(total - len(training.z), rng)
-            tests = Tests(pool, solver(pool.z[rows]), rows, log_drawn)
-            runs = Runs.joined([training, tests.runs])
-            evidence = evidence_of(posterior, at_draws, training, tests, len(modes), rng)
-            count = _further_runs(total, most)
-            if judge(evidence).verdict != "undecided" or not count:
-                break
-            # The earlier tests train the next correction, and fresh points test it.
-            training, total = runs, total + count
-            bar.total = total
+        with stages("correction, and FEM that tests it"):
+            while True:
+                training, pool = _train(solver, z, training, modes, count, most, rng)
+                rows, log_drawn = pool.tests(total - len(training.z), rng)
+                tests = Tests(pool, solver(pool.z[rows]), rows, log_drawn)
+                runs = Runs.joined([training, tests.runs])
+                evidence = evidence_of(posterior, at_draws, training, tests, len(modes), rng)
+                count = _further_runs(total, most)
+                if judge(evidence).verdict != "undecided" or not count:
+                    break
+                # The earlier tests train the next correction, and fresh points test it.
+                training, total = runs, total + count
+                bar.total = total
         bar.close()
-        change = mesh_change(pool, simulator, runs, mesh, rng, progress=progress)
+        with stages("finer mesh"):
+            change = mesh_change(pool, simulator, runs, mesh, rng, progress=progress)
     return Check(judge(replace(evidence, mesh=change)), posterior, tests)
 
 

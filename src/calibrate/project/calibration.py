@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -24,12 +25,14 @@ from calibrate.project.run import Run
 from calibrate.provenance import as_attributes
 from calibrate.state_names import split
 from calibrate.statistical_model.errors import map_errors
+from emulator.core.display import Stages
 from emulator.core.errors import InputError
 from emulator.core.store import write_json
 from emulator.surrogates.fem import FEMForward
 
 NOT_CERTIFIED = "not certified"
 DECIDED_BY_FEM = "decided by FEM"
+SECONDS = "seconds"  # attribute of a posterior: the seconds of each stage, as JSON
 
 
 def infer(
@@ -62,25 +65,31 @@ def infer(
             f"infer: {type(run).__name__} is not one run; calibrate infer FILE takes members of a "
             "population, and calibrate.hierarchy their models"
         )
-    target = None if folder is None else Path(folder)
+    target, stages = None if folder is None else Path(folder), Stages(show=progress)
     with nullcontext() if target is None else reserved(target, force=force):
-        problem = with_data(read_problem(run))
-        model, data = build_model(problem, progress=progress)
+        with stages("scene and data"):
+            problem = with_data(read_problem(run))
+        with stages("forward map and model"):
+            model, data = build_model(problem, progress=progress)
         sampler, options = problem.run.sampling()
-        posterior = sample(
-            model,
-            data,
-            sampler=sampler.name,
-            options=options,
-            seed=problem.run.seed,
-            progress=progress,
-            simulator=problem.simulator if sampler.solves_fem else None,
-            checkpoint=None if target is None else target / SAMPLING,
-        )
+        with stages("sampling"):
+            posterior = sample(
+                model,
+                data,
+                sampler=sampler.name,
+                options=options,
+                seed=problem.run.seed,
+                progress=progress,
+                simulator=problem.simulator if sampler.solves_fem else None,
+                checkpoint=None if target is None else target / SAMPLING,
+            )
         errors = {}
         if check_map and not (sampler.solves_fem or isinstance(model.full, FEMForward)):
-            errors = map_errors(posterior.model, problem.simulator, posterior.draws())
-        attributes = {SCALED_NOISE: problem.scaled_noise, MAP_ERRORS: errors}
+            with stages("check of the map"):
+                errors = map_errors(posterior.model, problem.simulator, posterior.draws())
+        attributes = {
+            SCALED_NOISE: problem.scaled_noise, MAP_ERRORS: errors, SECONDS: stages.seconds,
+        }  # fmt: skip
         posterior.tree.attrs.update(as_attributes(attributes))
         if target is not None:
             save_results(target, problem, posterior)
@@ -93,6 +102,7 @@ def certify_and_keep(
     *,
     load_steps: int = 1,
     reweight_to: str | Path | None = None,
+    progress: bool = False,
     **options: Any,
 ) -> Certificate:
     """Check a posterior against FEM and write ``certificate.json``.
@@ -105,14 +115,18 @@ def certify_and_keep(
     load_steps : load steps of every solve.
     reweight_to : the folder that the reweighted posterior is written to, ready to be certified in
         its turn, where the verdict allows it (:func:`calibrate.certificate.check.can_reweight`).
+    progress : whether progress bars, and the seconds of each stage, are shown.
     options : the numbers of FEM runs, and where they are solved, as of
         :func:`calibrate.certificate.examine`, with its errors.
     """
-    simulator = simulator_of(posterior.model.forward.scene, load_steps)
-    check = examine(posterior, simulator, **options)
+    stages = Stages(show=progress)
+    with stages("simulator"):
+        simulator = simulator_of(posterior.model.forward.scene, load_steps)
+    check = examine(posterior, simulator, stages=stages, progress=progress, **options)
     write_json(Path(folder) / CERTIFICATE, check.certificate.to_json())
     errors = check.certificate.evidence.map_errors
-    posterior.tree.attrs.update(as_attributes({MAP_ERRORS: errors}))
+    seconds = json.loads(posterior.tree.attrs.get(SECONDS, "{}")) | stages.seconds
+    posterior.tree.attrs.update(as_attributes({MAP_ERRORS: errors, SECONDS: seconds}))
     remove_pages(Path(folder).resolve())
     if reweight_to is not None and can_reweight(check.certificate):
         save_reweighted(reweighted(check), Path(folder), Path(reweight_to))
@@ -137,6 +151,7 @@ def report(run: Run, posterior: Posterior, certificate: Certificate | None) -> d
         "draws": int(posterior.tree["posterior"].sizes["draw"]),
         "chains": int(posterior.tree["posterior"].sizes["chain"]),
         "warnings": posterior.warnings(),
+        "seconds": json.loads(posterior.tree.attrs.get(SECONDS, "{}")),
     }
     if "fem_solves" in posterior.tree.attrs:
         result["fem_solves"] = int(posterior.tree.attrs["fem_solves"])

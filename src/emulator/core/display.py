@@ -7,13 +7,17 @@ keep every one of a bar's states.
 from __future__ import annotations
 
 import sys
+import time
 from abc import abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from html import escape
 from typing import Any
 
 from tqdm import tqdm
 
 EVERY = 10.0  # seconds between two lines; shorter work says nothing
+SHORTEST = 1.0  # seconds of the shortest stage that is printed
 
 
 class Lines(tqdm):
@@ -51,6 +55,26 @@ class Lines(tqdm):
 def counting(*arguments: Any, **options: Any) -> tqdm:
     """Return tqdm's bar where standard error is a terminal, else :class:`Lines`."""
     return (tqdm if sys.stderr.isatty() else Lines)(*arguments, **options)
+
+
+class Stages:
+    """The stages of a piece of work: each one's seconds, printed as it ends.
+
+    seconds : the seconds of each finished stage, by its name.
+    """
+
+    def __init__(self, *, show: bool) -> None:
+        self.seconds: dict[str, float] = {}
+        self._show = show
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        """Time the stage ``name``; one that took less than a second is not printed."""
+        begin = time.perf_counter()
+        yield
+        self.seconds[name] = seconds = round(time.perf_counter() - begin, 2)
+        if self._show and seconds >= SHORTEST:
+            print(f"{name}: {seconds:.1f} s", file=sys.stderr, flush=True)
 
 
 class TableRepr:

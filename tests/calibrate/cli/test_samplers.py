@@ -50,6 +50,7 @@ def test_delayed_acceptance_goes_on_after_a_kill(capsys, monkeypatch, tmp_path):
     assert result["verdict"] == "decided by FEM"
     assert 2 * 15 < result["fem_solves"] <= 2 * (1 + 20 + 4 * 15)
     assert any("effective draws" in sentence for sentence in result["warnings"])
+    assert list(result["seconds"]) == ["scene and data", "forward map and model", "sampling"]
     assert not (killed / SAMPLING).exists()
     first, second = (read_tree(folder / "posterior.nc")["posterior"] for folder in (killed, whole))
     for name in ("mu", "lam"):

@@ -1,4 +1,4 @@
-"""Long work without a terminal prints a line now and then, short work none."""
+"""Long work without a terminal prints a line now and then and its stages, short work none."""
 
 import io
 
@@ -45,3 +45,19 @@ def test_an_iterable_and_a_postfix(clock):
         clock[0] += 20.0
         bar.set_postfix(loss=f"{k}")
     assert said.getvalue().splitlines()[-1] == "done: 3 of 3, 60 s, loss=2"
+
+
+def test_stages_say_their_seconds_if_they_took_one(monkeypatch, capsys):
+    now = [0.0]
+    monkeypatch.setattr("time.perf_counter", lambda: now[0])
+    stages = display.Stages(show=True)
+    for name, seconds in (("data", 0.5), ("sampling", 5.5)):
+        with stages(name):
+            now[0] += seconds
+    assert stages.seconds == {"data": 0.5, "sampling": 5.5}
+    assert capsys.readouterr().err == "sampling: 5.5 s\n"
+    silent = display.Stages(show=False)
+    with silent("sampling"):
+        now[0] += 9.0
+    assert silent.seconds == {"sampling": 9.0}
+    assert capsys.readouterr().err == ""
