@@ -14,8 +14,7 @@ from studies.common.timing import milliseconds, per_call
 import calibrate as cal
 import emulator as em
 from calibrate.measurements import parse_observation
-from calibrate.samplers.density import density_of
-from calibrate.samplers.nuts import BlackJAXNUTSOptions
+from calibrate.samplers import SAMPLERS, density_of
 from calibrate.statistical_model import Data, Model
 
 SCENE = "left_ventricle"
@@ -26,6 +25,7 @@ KINDS: dict[str, dict[str, float]] = {
     "landmarks:24+volume": {"displacement": 0.3, "volume": 1.0},
 }
 CHAINS = 2
+OURS = ("importance", "nuts", "blackjax_nuts")
 
 
 def problem(observe: str, noise: dict[str, float], seed: int) -> tuple[Model, dict[str, Any]]:
@@ -65,8 +65,10 @@ def gradient_s(model: Model, data: Data, count: int, seed: int) -> float:
 
 def by_ours(sampler: str, model: Model, data: dict[str, Any], draws: int, seed: int) -> np.ndarray:
     """Draws (chains, s, p) of one of our samplers, a fixed number of them."""
-    options = {"nuts": cal.NUTSOptions, "blackjax_nuts": BlackJAXNUTSOptions}[sampler]
-    given = options(draws, draws, CHAINS, rounds=1)
+    length = {"draws": draws, "chains": CHAINS, "rounds": 1}
+    if sampler != "importance":
+        length["warmup"] = draws
+    given = SAMPLERS[sampler].options(**length)
     told = cal.sample(model, data, sampler=sampler, options=given, seed=seed, predictions=False)
     return np.stack([told.tree["posterior"][name].values for name in model.names], axis=-1)
 
@@ -95,8 +97,8 @@ def study(kinds: int, draws: int, loop: int, seed: int) -> list[dict[str, Any]]:
         model, data = problem(observe, noise, seed)
         checked = model.check_data(data)
         samplers: dict[str, Callable[[int], np.ndarray]] = {
-            "nuts": lambda s, m=model, d=data: by_ours("nuts", m, d, draws, s),
-            "blackjax_nuts": lambda s, m=model, d=data: by_ours("blackjax_nuts", m, d, draws, s),
+            name: lambda s, n=name, m=model, d=data: by_ours(n, m, d, draws, s) for name in OURS
+        } | {
             "NumPyro's NUTS": by_numpyro(model, checked, draws),
         }
         one = gradient_s(model, checked, loop, seed)

@@ -53,7 +53,7 @@ def test_two_modes_that_nuts_gets_wrong_have_their_shares(two_modes):
     assert posterior.warnings() == []
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_narrow_modes_far_apart_in_five_dimensions(seed):
     """Shares 0.3 and 0.7, sds a hundredth of the prior's, in correlated coordinates."""
     root = np.linalg.cholesky(0.04**2 * (0.5 * np.eye(5) + 0.5))
