@@ -86,7 +86,7 @@ def certificate(found: Campaign) -> Certificate:
     means = _figures(named, there.mean(axis=0) + value[:p], error[:p])
     by_fem = sd * np.exp(value[p:])
     sds = _figures(named, by_fem, by_fem * error[p:])
-    return judge(Evidence(changes, changes, means, sds, sampling, physics, tail, {}, mesh))
+    return judge(Evidence(changes, changes, means, sds, sampling, physics, tail, {}, mesh=mesh))
 
 
 def decided(heart: Heart, plan: Plan, kept: Path | None, seed: int) -> Campaign:
