@@ -35,7 +35,7 @@ def test_what_the_readme_imports_is_there():
             id="importing turns on float64, loads JAX and does nothing else",
         ),
         pytest.param(
-            # ArviZ puts a lazy module in NumPyro's place (calibrate.whole_numpyro).
+            # ArviZ puts a lazy module in NumPyro's place (calibrate.mend_numpyro).
             "import arviz_base, calibrate; from numpyro import distributions;"
             "calibrate.sample; distributions.distribution",
             id="ArviZ may be imported first",

@@ -64,6 +64,8 @@ from .statistical_model.errors import with_systematic
 from .statistical_model.model import model
 from .um_bridge import serve
 
+def mend_numpyro() -> None: ...
+
 __version__: str
 
 __all__ = [

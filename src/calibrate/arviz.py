@@ -1,4 +1,4 @@
-"""ArviZ as this package uses it, imported after NumPyro, see :mod:`calibrate.whole_numpyro`."""
+"""ArviZ as this package uses it, imported after NumPyro, see :func:`calibrate.mend_numpyro`."""
 
 import numpyro.distributions  # isort: skip  # noqa: F401
 import arviz_base as base

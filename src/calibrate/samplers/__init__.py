@@ -4,12 +4,11 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
-from calibrate.samplers.auto import AUTO, AutoOptions
 from calibrate.samplers.chains import ChainSampler
 from calibrate.samplers.delayed_acceptance import DELAYED_ACCEPTANCE, DelayedAcceptanceOptions
 from calibrate.samplers.density import Density, density_of, named_draws
 from calibrate.samplers.diagnostics import r_hat
-from calibrate.samplers.importance import IMPORTANCE, ImportanceOptions
+from calibrate.samplers.importance import AUTO, IMPORTANCE, AutoOptions, ImportanceOptions
 from calibrate.samplers.laplace import LAPLACE, LaplaceOptions
 from calibrate.samplers.mclmc import MCLMC, MCLMCOptions
 from calibrate.samplers.nuts import BLACKJAX_NUTS, NUTS, BlackJAXNUTSOptions, NUTSOptions

@@ -25,6 +25,7 @@ import numpyro.distributions as dist
 from jax.flatten_util import ravel_pytree
 from numpyro import handlers
 
+from calibrate import mend_numpyro
 from calibrate.measurements import Observation, Observations, leave_out_missing, observations
 from calibrate.measurements.magnitude import PRIOR_DRAWS, check_magnitudes
 from calibrate.model_error import ModelError
@@ -34,7 +35,6 @@ from calibrate.priors.priors import Conditional
 from calibrate.state_names import split
 from calibrate.statistical_model.load_states import LoadStates, boxed, load_states
 from calibrate.statistical_model.prior_range import check_known, fit_to, standardised
-from calibrate.whole_numpyro import mend_numpyro
 from emulator.core.errors import InputError
 from emulator.scenes.parameter_space import Parameter
 from emulator.surrogates.protocol import ForwardMap, Prediction

@@ -11,8 +11,13 @@ from jax.scipy.stats import norm
 import calibrate as cal
 from calibrate.posterior.diagnosis import diagnose
 from calibrate.samplers import Density, ImportanceOptions, density_of, find_sampler
-from calibrate.samplers.auto import AUTO, SAMPLED_BY, AutoOptions
-from calibrate.samplers.importance import IMPORTANCE
+from calibrate.samplers.importance import (
+    AUTO,
+    IMPORTANCE,
+    NOT_BY_IMPORTANCE,
+    SAMPLED_BY,
+    AutoOptions,
+)
 from calibrate.samplers.proposals import Kernels, separate
 from calibrate.samplers.protocol import Context
 from emulator.core.errors import InputError, SolverError
@@ -122,18 +127,20 @@ def test_nuts_is_taken_where_importance_sampling_does_not_work(beam, simulator, 
     model, data = linear_problem(beam)
     short = AutoOptions(200, 200, rounds=1)
 
-    def sampler_of(model, **more):
-        posterior = cal.sample(model, data, options=short, predictions=False, **more)
-        return posterior.tree.attrs[SAMPLED_BY]
+    def attributes_of(model):
+        return cal.sample(model, data, options=short, predictions=False).tree.attrs
 
-    assert sampler_of(model) == "importance"
+    assert attributes_of(model)[SAMPLED_BY] == "importance"
     asked = []
-    monkeypatch.setattr("calibrate.samplers.auto.IMPORTANCE", Refusing(asked))
-    assert sampler_of(model) == "nuts"
+    monkeypatch.setattr("calibrate.samplers.importance.IMPORTANCE", Refusing(asked))
+    attributes = attributes_of(model)
+    assert attributes[SAMPLED_BY] == "nuts"
+    assert attributes[NOT_BY_IMPORTANCE] == "importance: refused"
     assert len(asked) == 1
     assert not density_of.__wrapped__(replace(model, forward=fem_forward(simulator))).batches
     of = replace(density_of(model.given(data)[0]), batches=False)
-    AUTO.sample(of, model.given(data)[1], short, Context())
+    draws = AUTO.sample(of, model.given(data)[1], short, Context())
+    assert draws.attributes[NOT_BY_IMPORTANCE] == "the forward map solves FEM"
     assert len(asked) == 1
 
 

@@ -8,8 +8,7 @@ from emulator.geometry.generators.ellipsoid import (
     human_ventricle,
     truncated_ellipsoid,
 )
-from emulator.geometry.generators.organ import organ
-from emulator.geometry.generators.sphere import sphere_octant
+from emulator.geometry.generators.sphere import organ, sphere_octant
 
 __all__ = [
     "HUMAN",

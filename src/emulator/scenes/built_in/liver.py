@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from emulator.geometry.generators.body import resolved
-from emulator.geometry.generators.organ import organ
+from emulator.geometry.generators.sphere import organ
 from emulator.mechanics.laws import find_law
 from emulator.scenes.loads import Gravity
 from emulator.scenes.parameter_space import Parameter
@@ -16,7 +16,7 @@ _SIZES: dict[int, dict[str, Any]] = {
     1: {"shells": 6, "clustering": 0.0, "ligament_shells": 6, "ligament": None},
     2: {"shells": 5, "clustering": 0.5, "ligament_shells": 5, "ligament": 2.0},
 }
-"""Mesh by default, as in :func:`~emulator.geometry.generators.organ.organ`, and the ligament's
+"""Mesh by default, as in :func:`~emulator.geometry.generators.sphere.organ`, and the ligament's
 stiffness: 923 linear nodes, 3871 quadratic ones."""
 
 
@@ -35,7 +35,7 @@ def liver(
     Parameters
     ----------
     shells, clustering, ligament_shells : the resolution of the mesh, as in
-        :func:`~emulator.geometry.generators.organ.organ`; by default what the elements' order
+        :func:`~emulator.geometry.generators.sphere.organ`; by default what the elements' order
         needs.
     order : the order of the elements.
     ligament : its stiffness in kPa/mm, 2 by default. Linear elements have it clamped by default, as

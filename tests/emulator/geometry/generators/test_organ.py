@@ -3,7 +3,7 @@ import pytest
 
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import dihedral_angles
-from emulator.geometry.generators.organ import organ
+from emulator.geometry.generators.sphere import organ
 from geometry_support import assert_sound, order_of, volume
 
 
