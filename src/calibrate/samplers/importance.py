@@ -149,6 +149,9 @@ class _Run:
         self.points = Population.of_prior(density, data, self._rng)
         if not np.isfinite(self.points.log_weights).any():
             raise SolverError("the posterior density is zero at every draw of the prior")
+
+    def search(self) -> None:
+        """Move from the prior to the posterior, and fit a proposal there."""
         while True:  # one step at least: proposals are better than the prior
             self._go_to(self.points.stepped(self.points.log_weights, self._rng), STEP)
             if effective_number(self.points.log_weights) >= _FOUND:
@@ -205,23 +208,23 @@ class ImportanceSampling(Sampler):
             The density is zero wherever the prior was drawn, or a population did not come to the
             posterior within ``options.evaluations``.
         """
-        seeds = [[context.seed, k] for k in range(options.chains)]
+        # One after the other, so that programs are compiled once; each is a thread from there on.
+        seeds = ([context.seed, k] for k in range(options.chains))
+        runs = [_Run(density, data, options, seed) for seed in seeds]
         with (
             counting(desc=self.name, total=options.chains, disable=not context.progress) as bar,
             ThreadPoolExecutor(min(density.at_once, options.chains)) as pool,
         ):
 
-            def begin(seed: list[int]) -> _Run:
-                run = _Run(density, data, options, seed)
+            def search(run: _Run) -> None:
+                run.search()
                 bar.update()
-                return run
-
-            runs = list(pool.map(begin, seeds))
 
             def draw(total: int) -> Draws:
                 z, lp = zip(*pool.map(lambda run: run.draw(total), runs), strict=True)
                 return Draws(np.stack(z), {"lp": np.stack(lp)})
 
+            list(pool.map(search, runs))
             draws = draw(options.draws)
             if not converged(draws.z, options.r_hat, options.ess):
                 z, log_weights = _of_all(runs)

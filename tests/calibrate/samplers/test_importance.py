@@ -108,6 +108,16 @@ def test_a_sheet_that_is_bent_and_cut_by_the_box(beam):
         assert draws.std() == pytest.approx(sd, rel=0.05)
 
 
+@pytest.mark.parametrize("size", [1, 8])
+def test_a_gaussian_of_as_few_and_as_many_unknowns_as_it_is_taken_for(size):
+    mean, sd = np.linspace(-2.0, 2.0, size), 0.3
+    draws = sampled(density(lambda z: norm.logpdf(z, jnp.asarray(mean), sd).sum(), size))
+    precision = sd**-2 + SD**-2
+    z = draws.z.reshape(-1, size)
+    np.testing.assert_allclose(z.mean(axis=0), mean / sd**2 / precision, atol=0.025)
+    np.testing.assert_allclose(z.std(axis=0), precision**-0.5, rtol=0.06)
+
+
 def test_the_same_seed_gives_the_same_draws_whatever_the_threads(beam):
     model, data = linear_problem(beam)
     model, checked = model.given(data)
