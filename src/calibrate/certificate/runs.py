@@ -103,11 +103,13 @@ class Solver:
         new_draws = [{name: values[s] for name, values in draws.items()} for s in rows]
         examined = {k for k, s in enumerate(rows) if s < stability}
         self.bar.update(len(keys) - len(new))
-        for k, likelihoods in self.likelihood.many(
-            new_draws, self.predictive.data, stability=examined, slopes=slopes
-        ):
-            self._known[new[k]] = likelihoods
-            self.bar.update()
+        if new:
+            solved = self.likelihood.many(
+                new_draws, self.predictive.data, stability=examined, slopes=slopes
+            )
+            for k, likelihoods in solved:
+                self._known[new[k]] = likelihoods
+                self.bar.update()
         runs = [self._known[key] for key in keys]
         missing = np.full(len(self.predictive.scales), np.nan)
         return Runs(
