@@ -73,6 +73,7 @@ def test_gradient_and_curvature_are_those_of_differences(fem, posterior):
         likelihood = FEMLikelihood(posterior.model, LinearSimulator(fem))
         solver = Solver(predictive, likelihood, bar)
         here = solver(z[None], slopes=True)
+        np.testing.assert_array_equal(solver(z[None]).fem, here.fem)  # known: nothing to solve
         ahead, behind = (solver(z + sign * 1e-4 * np.eye(2)) for sign in (1.0, -1.0))
     prior, gradient, curvature = predictive.curvature(z, here.means[0], here.slopes[0])
 
