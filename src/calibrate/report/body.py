@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import product
 from typing import Any
 
@@ -33,13 +34,15 @@ def body_figure(posterior: Posterior, simulator: Simulator | None) -> go.Figure:
     scene = model.forward.scene
     thetas = posterior.thetas(model.states.states[-1])
     rows = np.linspace(0, len(thetas) - 1, min(_MOMENTS, len(thetas))).astype(int)
-    predict = jax.jit(lambda t: jax.lax.map(model.full, t))
-    fields = np.asarray(predict(thetas[rows]))  # (s, n, 3)
-    mean = fields.mean(axis=0)
     centre = thetas.mean(axis=0)
-    colours = _colours(scene, fields, mean, centre)
+    predict = jax.jit(lambda t: jax.lax.map(model.full, t))
+    predicted = np.asarray(predict(jnp.vstack([thetas[rows], centre])))
+    fields, at_centre = predicted[:-1], predicted[-1]  # (s, n, 3) and (n, 3)
+    mean = fields.mean(axis=0)
+    of_elements = element_fields(scene, jnp.asarray(mean), centre)
+    colours = _colours(scene, fields, mean, of_elements)
     if simulator is not None and (solution := simulator.solve(centre)).converged:
-        wrong = np.linalg.norm(model.full(centre) - solution.displacement, axis=1)
+        wrong = np.linalg.norm(at_centre - solution.displacement, axis=1)
         colours["error against FEM at the mean theta (mm)"] = wrong
     shown = fields[np.linspace(0, len(fields) - 1, min(_DRAWS, len(fields))).astype(int)]
     nodes, triangles = surface_mesh(scene.mesh.surface)
@@ -56,7 +59,7 @@ def body_figure(posterior: Posterior, simulator: Simulator | None) -> go.Figure:
         name="at rest", showlegend=True, hoverinfo="skip",
     )  # fmt: skip
     if scene.fibres is not None:
-        figure.add_trace(_fibres(scene, mean, centre))
+        figure.add_trace(_fibres(scene, mean, of_elements["deformed_fibres"]))
     frames = {"mean": mean} | {f"draw {n}": u for n, u in enumerate(shown, start=1)}
     at_rest = scene.mesh.nodes[nodes]
     figure.frames = [
@@ -85,18 +88,17 @@ def _camera(extent: np.ndarray) -> dict[str, Any]:
 
 
 def _colours(
-    scene: Scene, fields: np.ndarray, mean: np.ndarray, theta: jax.Array
+    scene: Scene, fields: np.ndarray, mean: np.ndarray, of_elements: Mapping[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
     """Return the values (n,) at the nodes by which the surface can be coloured, by their labels."""
     colours = {
         "mean displacement (mm)": np.linalg.norm(mean, axis=1),
         "sd of displacement (mm)": np.sqrt(fields.var(axis=0).sum(axis=1)),
     }
-    element_values = element_fields(scene, jnp.asarray(mean), theta)
-    largest = np.linalg.eigvalsh(element_values["green_lagrange"])[:, -1]
+    largest = np.linalg.eigvalsh(of_elements["green_lagrange"])[:, -1]
     colours["largest principal strain"] = _nodal(scene, largest)
-    if "fibre_stretch" in element_values:
-        colours["fibre stretch"] = _nodal(scene, element_values["fibre_stretch"])
+    if "fibre_stretch" in of_elements:
+        colours["fibre stretch"] = _nodal(scene, of_elements["fibre_stretch"])
     return colours
 
 
@@ -121,9 +123,8 @@ def _coloured(values: np.ndarray, title: str) -> dict[str, Any]:
     }
 
 
-def _fibres(scene: Scene, mean: np.ndarray, theta: jax.Array) -> go.Scatter3d:
-    """Return short lines along the deformed fibres of some elements."""
-    directions = element_fields(scene, jnp.asarray(mean), theta)["deformed_fibres"]
+def _fibres(scene: Scene, mean: np.ndarray, directions: np.ndarray) -> go.Scatter3d:
+    """Return short lines along the deformed fibres, ``directions`` (m, 3), of some elements."""
     some = np.linspace(0, len(directions) - 1, min(len(directions), _FIBRES)).astype(int)
     middle = (scene.mesh.nodes + mean)[scene.mesh.elements[some, :4]].mean(axis=1)
     half = 0.5 * np.cbrt(scene.discretisation.weights.sum(axis=1)[some])[:, None] * directions[some]

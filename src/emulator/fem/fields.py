@@ -8,12 +8,14 @@ with :math:`P_a` the stress of active tension.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.fem.compiled import compiled
 from emulator.fem.energy import at_points, displacement_gradient, energy_of_gradient
 from emulator.geometry.fibres import unit
 from emulator.mechanics.kinematics import determinant
@@ -37,7 +39,18 @@ def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np
     ``fibres`` and ``deformed_fibres`` (m, 3), both of unit length, and ``fibre_stretch`` (m,); with
     regions also ``regions`` (m,).
     """
-    H = displacement_gradient(scene, jnp.asarray(u))
+    means = compiled(partial(_means, scene))(jnp.asarray(u), jnp.asarray(theta))
+    fields = {name: np.asarray(values) for name, values in means.items()}
+    for name in {"fibres", "deformed_fibres"} & fields.keys():
+        fields[name] = unit(fields[name])
+    if scene.regions is not None:
+        fields["regions"] = scene.regions
+    return fields
+
+
+def _means(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, jax.Array]:
+    """Return the means of :func:`element_fields`; those of directions are not of unit length."""
+    H = displacement_gradient(scene, u)
     F = H + jnp.eye(3, dtype=H.dtype)
     J = at_points(determinant, F)
     P = _first_piola(scene, H, theta)
@@ -47,21 +60,18 @@ def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np
         P = sum((stress for stress in active if stress is not None), P)
     # Round-off leaves sigma slightly asymmetric; eigenvalue routines need it symmetric.
     sigma = _symmetric(P @ jnp.swapaxes(F, -1, -2)) / J[..., None, None]
-    E = _symmetric(H + 0.5 * jnp.swapaxes(H, -1, -2) @ H)
-    weights = scene.discretisation.weights
-    weights = weights / weights.sum(axis=1, keepdims=True)
-
-    def mean(field: jax.Array) -> np.ndarray:
-        return np.asarray(jnp.einsum("mq,mq...->m...", weights, field))
-
-    fields = {"J": mean(J), "cauchy_stress": mean(sigma), "green_lagrange": mean(E)}
+    fields = {
+        "J": J,
+        "cauchy_stress": sigma,
+        "green_lagrange": _symmetric(H + 0.5 * jnp.swapaxes(H, -1, -2) @ H),
+    }
     if scene.fibres is not None:
         along = jnp.einsum("mqij,mqj->mqi", F, fibres)
-        fields["fibres"], fields["deformed_fibres"] = unit(mean(fibres)), unit(mean(along))
-        fields["fibre_stretch"] = mean(jnp.linalg.norm(along, axis=-1))
-    if scene.regions is not None:
-        fields["regions"] = scene.regions
-    return fields
+        fields |= {"fibres": fibres, "deformed_fibres": along}
+        fields["fibre_stretch"] = jnp.linalg.norm(along, axis=-1)
+    weights = scene.discretisation.weights
+    weights = weights / weights.sum(axis=1, keepdims=True)
+    return {name: jnp.einsum("mq,mq...->m...", weights, field) for name, field in fields.items()}
 
 
 def _first_piola(scene: Scene, H: jax.Array, theta: jax.Array) -> jax.Array:

@@ -119,12 +119,12 @@ def test_stdout_is_one_json_document(folder, words, request):
         lines = ""
         while not lines.endswith("\n}\n"):
             lines += process.stdout.readline()
-        server = HTTPConnection(urlsplit(json.loads(lines)["address"]).netloc, timeout=60)
+        server = HTTPConnection(urlsplit(json.loads(lines)["address"]).netloc, timeout=300)
         with closing(server):
             server.request("GET", "/Info")
             server.getresponse().read()  # once it answers, Ctrl-C is its end
         process.send_signal(signal.SIGINT)
-        said, errors = process.communicate(timeout=60)
+        said, errors = process.communicate(timeout=300)
         assert (said, process.returncode) == ("", 0), errors
         return
     said, errors = process.communicate()
