@@ -4,6 +4,7 @@ Compiled programs are kept in a folder that all workers, and the processes that 
 compilation is most of the time, and most programs are wanted by several of them.
 """
 
+import gc
 import os
 from pathlib import Path
 
@@ -25,16 +26,21 @@ CASES = SHARED / "cases"
 
 
 # A compiled program takes some ten memory maps. Linux allows a process 65 530; beyond, XLA crashes.
-MAPS = Path("/proc/self/maps")
+MAPS, PAGES = Path("/proc/self/maps"), Path("/proc/self/statm")
 MOST_MAPS = 30_000
+MOST_BYTES = 4e9  # in memory, of a process that is one of two
 
 
 @pytest.fixture(scope="module", autouse=True)
 def few_programs():
-    """Drop compiled programs after a module that leaves the process with too many memory maps."""
+    """Drop compiled programs after a module that leaves the process with too much memory."""
     yield
-    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > MOST_MAPS:
+    if not MAPS.exists():
+        return
+    resident = int(PAGES.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    if resident > MOST_BYTES or MAPS.read_bytes().count(b"\n") > MOST_MAPS:
         jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="session")

@@ -46,9 +46,17 @@ def run(problem, name, **more):
     return cal.sample(model, data, sampler=name, options=options, seed=5, predictions=False, **more)
 
 
+# A run of these takes seconds, and begins again.
+SHORT = ("auto", "importance")
+
+
 @pytest.mark.parametrize(
     "name",
-    [n if n == "nuts" else pytest.param(n, marks=pytest.mark.slow) for n in SAMPLERS],
+    [
+        n if n == "nuts" else pytest.param(n, marks=pytest.mark.slow)
+        for n in SAMPLERS
+        if n not in SHORT
+    ],
 )
 def test_a_killed_run_goes_on_to_the_same_draws(name, problem, monkeypatch, tmp_path):
     """Killed early, in the pilot run or the first population, in the middle and at the end."""
