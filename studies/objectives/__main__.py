@@ -42,6 +42,7 @@ OBJECTIVES = {
     "both": ("DD and PI", "tab:red"),
 }
 UNTRAINED, MECHANICS = "the centre's solution", "recipe mechanics"
+ERRORS = ("err_u", "err_F", "err_I1", "err_Pi")  # those of the paper, drawn and judged
 COARSE = (4, 2, 2)
 SMALL = Architecture(steps=2, latent=8, hidden=(16, 16))
 
@@ -136,8 +137,7 @@ def draw(errors: dict[str, Errors], path: Path, title: str) -> None:
     """Densities of the four errors, one curve for each objective."""
     plt = pyplot()
     figure, grid = plt.subplots(2, 2, figsize=(9.5, 6.6), layout="constrained")
-    names = [name for name in LABELS if name in errors[UNTRAINED].fields]
-    for axes, name in zip(grid.flat, names, strict=True):
+    for axes, name in zip(grid.flat, ERRORS, strict=True):
         for label, found in errors.items():
             curve = log_density(found.fields[name])
             if curve is None:
@@ -158,10 +158,7 @@ def draw(errors: dict[str, Errors], path: Path, title: str) -> None:
 
 def check(cases: list[dict[str, Any]]) -> None:
     """The claims of the study's README."""
-    medians = {
-        key: {case["name"]: case[key]["median"] for case in cases}
-        for key in ("err_u", "err_F", "err_I1", "err_Pi")
-    }
+    medians = {key: {case["name"]: case[key]["median"] for case in cases} for key in ERRORS}
     for key in ("err_F", "err_I1", "err_Pi"):
         assert medians[key]["gradients"] < 0.5 * medians[key]["simulations"], key
     assert medians["err_u"]["gradients"] < 2.0 * medians["err_u"]["simulations"]
