@@ -16,8 +16,8 @@
 #
 # 1. BlackJAX, with a kernel of yours on the toolkit's log density;
 # 2. NumPyro, with the forward map inside a model of yours;
-# 3. `cal.sample` with one of its samplers: importance sampling, NUTS of NumPyro or BlackJAX, MCLMC, SMC, the Laplace
-#    approximation, and delayed acceptance, which draws from the posterior of finite elements itself.
+# 3. `cal.sample` with one of its samplers: NUTS of NumPyro or BlackJAX, MCLMC, SMC, the Laplace approximation, and delayed
+#    acceptance, which draws from the posterior of finite elements itself.
 #
 # At the end all are compared by effective draws a second, and by what they would cost with FEM in place of the emulator.
 
@@ -165,7 +165,6 @@ assert abs(found["noise_sd"].mean() - 0.3) < 4.0 * found["noise_sd"].std()
 # %%
 size = {"warmup": 300, "draws": 400, "chains": 4}
 OPTIONS = {
-    "importance": cal.ImportanceOptions(draws=400, rounds=1),
     "nuts": cal.NUTSOptions(**size, rounds=1),
     "blackjax_nuts": cal.BlackJAXNUTSOptions(**size, rounds=1),
     "mclmc": cal.MCLMCOptions(**size, rounds=1),
@@ -291,10 +290,8 @@ assert solves < 0.1 * float(posteriors["nuts"].tree["sample_stats"]["n_steps"].s
 assert certificate.verdict == "accepted"
 
 # %% [markdown]
-# The certificate says for 80 solves that the emulator's draws may be used as they are. So the order of things is: a
-# posterior with the emulator; a certificate; and where it does not accept, `cal.reweight`, or delayed acceptance, or a better
-# emulator.
+# The certificate says for 80 solves that the emulator's draws may be used as they are. So the order of things is: NUTS with the
+# emulator; a certificate; and where it does not accept, `cal.reweight`, or delayed acceptance, or a better emulator.
 #
-# Which sampler? The one that is chosen by default: importance sampling for up to eight unknowns, and NUTS beyond. `smc` is for
-# several modes among many unknowns, `mclmc` for many unknowns, `laplace` for a first look, `delayed_acceptance` where FEM has to
-# decide.
+# Which sampler? NUTS, unless there is a reason: `smc` for several modes or an evidence, `mclmc` for many parameters, `laplace`
+# for a first look, `delayed_acceptance` where FEM has to decide.

@@ -17,7 +17,6 @@ from typing import Any
 from tqdm import tqdm
 
 EVERY = 10.0  # seconds between two lines; shorter work says nothing
-SHORTEST = 1.0  # seconds of the shortest stage that is printed
 
 
 class Lines(tqdm):
@@ -69,11 +68,11 @@ class Stages:
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        """Time the stage ``name``; one that took less than a second is not printed."""
+        """Time the stage ``name``; one that took less than ``EVERY`` seconds is not printed."""
         begin = time.perf_counter()
         yield
         self.seconds[name] = seconds = round(time.perf_counter() - begin, 2)
-        if self._show and seconds >= SHORTEST:
+        if self._show and seconds >= EVERY:
             print(f"{name}: {seconds:.1f} s", file=sys.stderr, flush=True)
 
 

@@ -47,15 +47,15 @@ def test_an_iterable_and_a_postfix(clock):
     assert said.getvalue().splitlines()[-1] == "done: 3 of 3, 60 s, loss=2"
 
 
-def test_stages_say_their_seconds_if_they_took_one(monkeypatch, capsys):
+def test_stages_say_their_seconds_if_they_took_ten(monkeypatch, capsys):
     now = [0.0]
     monkeypatch.setattr("time.perf_counter", lambda: now[0])
     stages = display.Stages(show=True)
-    for name, seconds in (("data", 0.5), ("sampling", 5.5)):
+    for name, seconds in (("data", 0.5), ("sampling", 15.5)):
         with stages(name):
             now[0] += seconds
-    assert stages.seconds == {"data": 0.5, "sampling": 5.5}
-    assert capsys.readouterr().err == "sampling: 5.5 s\n"
+    assert stages.seconds == {"data": 0.5, "sampling": 15.5}
+    assert capsys.readouterr().err == "sampling: 15.5 s\n"
     silent = display.Stages(show=False)
     with silent("sampling"):
         now[0] += 9.0
