@@ -151,3 +151,20 @@ def share_and_evidence():
     density = np.exp(height)
     total = density.sum() * (mu[1] - mu[0])
     return density[mu > 75].sum() * (mu[1] - mu[0]) / total, np.log(total)
+
+
+@dataclass(frozen=True, eq=False)
+class Bent(LinearForward):
+    """A forward map that sees one number, Young's modulus, of theta."""
+
+    def __call__(self, theta):
+        mu, lam = theta[0], theta[1]
+        value = mu * (3 * lam + 2 * mu) / (lam + mu)
+        return jnp.ones((len(self.nodes), 3)) * value / 200.0
+
+
+def bent_problem(beam):
+    """Model and data whose posterior is a curve a thousandth wide across the whole box."""
+    forward = linear_forward(beam, of=Bent)
+    model = cal.model(forward, cal.nodal_displacements(beam, [3, 4, 5]), cal.GaussianNoise(sd=1e-3))
+    return model, np.asarray(forward.at(np.array([3, 4, 5]))(jnp.array([70.0, 70.0])))

@@ -19,7 +19,7 @@ however good or bad the correction is, and small where it is good.
 
 3. **Decide.** The check begins with 70 runs. While they leave the verdict undecided there are twice
    as many, up to 200: the earlier ones train, and fresh points test. A figure is compared with its
-   limit at each look, with an error wide enough for five looks
+   limit at each look, with an error wide enough for these three
    (:mod:`calibrate.certificate.verdict`).
 """
 
@@ -63,7 +63,7 @@ _STABILITY = 20  # draws at which the sign of the tangent is examined
 _CHAINS = 4  # chains of a reweighted posterior
 _OF_OTHER_DRAWS = (
     "log_evidence", "log_evidence_error", "pareto_k", "importance_efficiency", MISSED_BY, MISSED_AT,
-    MAP_ERRORS,
+    MAP_ERRORS, "weights_pareto_k", "evaluations",
 )  # fmt: skip
 
 
@@ -106,7 +106,7 @@ def examine(
     mesh : the number of solves on the next finer mesh (:mod:`calibrate.certificate.mesh`): 0 for
         none, up to 15; by default four more than there are unknowns.
     scheduler : the address of a Dask scheduler whose workers solve; by default this process does.
-    stages : takes the seconds of each stage.
+    stages : the record of the seconds of each stage.
 
     Raises
     ------

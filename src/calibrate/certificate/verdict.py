@@ -42,9 +42,9 @@ SMALLEST_P_WORST = 0.001
 # different whatever the tail; at 1.5 a tenth of the FEM runs would count.
 LARGEST_SPREAD = 1.5
 SMALLEST_POOL = 200.0  # effective points under the corrected map
-# Monte Carlo errors between a figure and its limit. Runs are doubled while they do not decide: at
-# 2.4 a figure that is at its limit is called within it at one of five looks with a probability of
-# at most 2.5 % (Pocock 1977).
+# Monte Carlo errors between a figure and its limit. Runs are doubled while they do not decide, and
+# fresh points test at each look, so errors are independent: at 2.4 a figure that is at its limit is
+# called within it at one of three looks with a probability of 1 - 0.9918^3 = 2.4 %, of five 4 %.
 _ERRORS = 2.4
 _MANY = 20.0  # factor in the number of runs above which the estimate of that factor is worthless
 

@@ -203,7 +203,7 @@ def diagnose(
             "(at least "
             f"{100.0 * _LOWEST_EFFICIENCY:.0f} %): use a sampler, such as nuts"
         )
-    if (k := attributes.get("weights_pareto_k", 0.0)) > limits.LARGEST_PARETO_SHAPE:
+    if not (k := attributes.get("weights_pareto_k", 0.0)) <= limits.LARGEST_PARETO_SHAPE:
         yield (
             f"the weights of importance sampling have a heavy tail, Pareto k {k:.2f} (at most "
             f"{limits.LARGEST_PARETO_SHAPE}): use another sampler, such as nuts"

@@ -264,7 +264,7 @@ class Auto(Sampler):
         Raises
         ------
         SolverError
-            As of NUTS.
+            No chain of NUTS could start where the density is finite.
         """
         draws = _by_importance(density, data, options, context)
         if isinstance(draws, Draws):

@@ -37,7 +37,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from calibrate.samplers.density import Density
+from calibrate.samplers.density import Density, prior_draws
 from calibrate.samplers.diagnostics import FEWEST_WEIGHTS, effective, normalised, pareto_shape
 from calibrate.samplers.protocol import Context, Draws, Options, Sampler
 from calibrate.statistical_model import Data
@@ -171,12 +171,10 @@ def _draw(
 class _Programs(NamedTuple):
     """Compiled functions of a density.
 
-    starts : (keys (s,)) -> draws of the prior (s, p).
     value_and_gradient : (z (p,), data) -> log density (), gradient (p,).
     heights : (z (s, p), data) -> log densities (s,).
     """
 
-    starts: Callable[..., Any]
     value_and_gradient: Callable[..., Any]
     heights: Callable[..., Any]
 
@@ -184,7 +182,6 @@ class _Programs(NamedTuple):
 @lru_cache(maxsize=4)
 def _compile(density: Density) -> _Programs:
     return _Programs(
-        jax.jit(jax.vmap(density.prior_draw)),
         jax.jit(jax.value_and_grad(density.log_density)),
         jax.jit(lambda z, data: jax.lax.map(lambda row: density.log_density(row, data), z)),
     )
@@ -221,7 +218,7 @@ def find_modes(
 
     minima = [
         minimise(negative, np.linalg.solve(factor, start), iterations=_MOST, tolerance=1e-12)
-        for start in np.asarray(programs.starts(jax.random.split(key, starts)))
+        for start in prior_draws(density, key, starts)
     ]
     minima = sorted((m for m in minima if np.isfinite(m.value)), key=lambda m: m.value)
     z = np.array([factor @ m.x for m in minima]).reshape(len(minima), density.dimension)

@@ -184,7 +184,7 @@ def _halved(z: np.ndarray) -> np.ndarray | None:
     """Return which of the points z (s, p) are in the first of two separate places, if they are."""
     covariance, fewest = np.atleast_2d(np.cov(z, rowvar=False)), 4 * (z.shape[1] + 1)
     values, vectors = np.linalg.eigh(covariance)
-    # Of coordinates that do not vary, round-off would decide.
+    # Round-off would part points along a coordinate that does not vary.
     if len(z) < 2 * fewest or not values[0] > 1e-12 * values[-1]:
         return None
     white = (z - z.mean(axis=0)) @ (vectors / np.sqrt(values))

@@ -171,3 +171,10 @@ def test_a_wrong_map_is_not_named_where_fem_repairs_it_and_decides_nothing_by_it
             replace(RIGHT, map_errors={"x": 0.3}, sampling=replace(RIGHT.sampling, r_hat=1.5))
         ).findings
     )
+
+
+def test_a_figure_at_its_limit_is_seldom_within_it_at_one_of_three_looks():
+    """Each look has fresh tests, hence an error of its own; 2.4 % by the normal distribution."""
+    errors = np.random.default_rng(0).normal(size=(40_000, 3))
+    within = [any(Figure(10.0 + e, 1.0).within(10.0) for e in looks) for looks in errors]
+    assert np.mean(within) == pytest.approx(0.0244, abs=4 * np.sqrt(0.0244 / 40_000))

@@ -22,7 +22,7 @@ from calibrate.samplers.proposals import Kernels, separate
 from calibrate.samplers.protocol import Context
 from emulator.core.errors import InputError, SolverError
 from emulator.surrogates.fem import fem_forward
-from linear_support import LinearForward, linear_forward, linear_problem, share_and_evidence
+from linear_support import bent_problem, linear_problem, share_and_evidence
 
 SD = 4.0  # of the prior of ``density``
 
@@ -85,15 +85,7 @@ def test_narrow_modes_far_apart_in_five_dimensions(seed):
 def test_a_sheet_that_is_bent_and_cut_by_the_box(beam):
     """mu known to a thousandth along a curve across the whole box of lam, by quadrature."""
 
-    class Bent(LinearForward):
-        def __call__(self, theta):
-            mu, lam = theta[0], theta[1]
-            value = mu * (3 * lam + 2 * mu) / (lam + mu)
-            return jnp.ones((len(self.nodes), 3)) * value / 200.0
-
-    forward = linear_forward(beam, of=Bent)
-    model = cal.model(forward, cal.nodal_displacements(beam, [3, 4, 5]), cal.GaussianNoise(sd=1e-3))
-    data = np.asarray(forward.at(np.array([3, 4, 5]))(jnp.array([70.0, 70.0])))
+    model, data = bent_problem(beam)
     posterior = cal.sample(model, data, predictions=False)
     assert posterior.tree.attrs[SAMPLED_BY] == "importance"
     mu, lam = np.meshgrid(np.linspace(67.0, 73.0, 12_001), np.linspace(50.0, 100.0, 401))
@@ -219,3 +211,7 @@ def test_points_of_one_place_are_not_parted(kind):
     rng = np.random.default_rng(0)
     draw = {"gaussian": rng.normal, "uniform": rng.uniform, "logistic": rng.logistic}[kind]
     assert len(separate(draw(size=(1000, 5)))) == 1
+    if kind in (gain := {"gaussian": -np.log(1.0 - 2.0 / np.pi), "uniform": np.log(4.0)}):
+        x = np.sort(draw(size=100_000))
+        halves = 0.5 * sum(np.log(half.var()) for half in np.split(x, 2))
+        assert np.log(x.var()) - halves == pytest.approx(gain[kind], abs=0.02)

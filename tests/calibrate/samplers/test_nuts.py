@@ -12,7 +12,7 @@ from emulator.fem import run_campaign, sobol
 from emulator.surrogates.corrected import corrected
 from emulator.surrogates.fem import fem_forward
 from emulator.surrogates.pod_gp import fit_reduced
-from linear_support import LinearForward, linear_forward
+from linear_support import bent_problem, linear_forward
 
 PRIOR_MEAN, PRIOR_SD = np.array([70.0, 75.0]), np.array([5.0, 8.0])
 
@@ -126,15 +126,7 @@ def test_a_fitted_shear_straightens_a_bent_ridge():
 def test_a_bent_posterior_is_sampled_well(beam):
     """mu known to a thousandth along a curve across the whole box of lam."""
 
-    class Bent(LinearForward):
-        def __call__(self, theta):
-            mu, lam = theta[0], theta[1]
-            value = mu * (3 * lam + 2 * mu) / (lam + mu)
-            return jnp.ones((len(self.nodes), 3)) * value / 200.0
-
-    forward = linear_forward(beam, of=Bent)
-    model = cal.model(forward, cal.nodal_displacements(beam, [3, 4, 5]), cal.GaussianNoise(sd=1e-3))
-    data = np.asarray(forward.at(np.array([3, 4, 5]))(jnp.array([70.0, 70.0])))
+    model, data = bent_problem(beam)
     posterior = cal.sample(model, data, sampler="nuts")
     table = posterior.summary()
     assert min(row["ess_bulk"] for row in table.values()) > 1000
