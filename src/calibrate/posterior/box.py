@@ -16,8 +16,9 @@ outwards, to :math:`t = -E`, it gives the mass beyond the exit, relative to that
 
 .. math:: M = p(0) \int_0^E e^{\alpha r - \max(\beta, 0)\, r^2}\, dr .
 
-The masses beyond both exits have their centres :math:`m_\pm` along :math:`d`. In a wider box the
-mean would move by
+The masses beyond both exits have their centres :math:`m_\pm` along :math:`d`, on from where draws
+*at* the exit stand (not where most lines end: across a thin posterior those end far from any draw).
+In a wider box the mean would move by
 
 .. math:: \Delta = \frac{M_+ (m_+ - \bar x) + M_- (m_- - \bar x)}{1 + M_+ + M_-}
 
@@ -156,8 +157,11 @@ def _exit(x: np.ndarray, d: np.ndarray, wider: np.ndarray, farthest: float) -> _
     share = np.bincount(first[near], minlength=len(d)) / near.sum()
     numbers = np.flatnonzero(moves)
     ends = tuple((int(numbers[k]), bool(high[k])) for k in np.flatnonzero(share >= _OFTEN))
-    # The exit lies this far from the draws' mean; the centre of what is outside lies further on.
-    to_exit = float(((x + t[:, None] * d) @ d)[near].mean() - (x @ d).mean())
+    # Where draws at the exit stand along d: a line through positions over distances, at distance 0.
+    position = x @ d
+    t_near, p_near = t[near] - t[near].mean(), position[near]
+    slope = float(t_near @ p_near) / max(float(t_near @ t_near), np.finfo(float).tiny)
+    to_exit = float(p_near.mean() - slope * t[near].mean() - position.mean())
     return _Exit(mass, to_exit + float(outside @ r) * T / mass if mass else 0.0, ends)
 
 

@@ -101,6 +101,16 @@ def test_a_ridge_across_the_box_is_none_and_a_short_one_is():
         assert bool(box_ends({"a": draws[0], "b": draws[1]}, box)) == is_cut
 
 
+@pytest.mark.parametrize(("inside", "is_cut"), [(2.1, False), (0.3, True)])
+def test_a_thin_ridge_that_touches_an_end_is_not_cut_by_it(inside, is_cut):
+    """An end 2.1 sd away moves a mean by 0.05 sd; lines across the ridge end 30 of its sd away."""
+    along, across = RNG(2).normal(size=(2, 8000)) * [[0.05], [0.0087]]
+    a = 2.0 - 0.05 * inside + along
+    draws = np.stack([a, 1.5 + 0.15 * along + across])[:, a < 2.0]
+    box = {name: Parameter(name, "", 1.0, 2.0) for name in "ab"}
+    assert bool(box_ends({"a": draws[0], "b": draws[1]}, box)) == is_cut
+
+
 def test_degenerate_draws_have_no_ends():
     assert one(np.full(100, 2.0)) == []
     assert box_ends({"a": RNG(0).normal(size=100)}, {}) == []
