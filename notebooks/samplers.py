@@ -16,8 +16,8 @@
 #
 # 1. BlackJAX, with a kernel of yours on the toolkit's log density;
 # 2. NumPyro, with the forward map inside a model of yours;
-# 3. `cal.sample` with one of its samplers: NUTS of NumPyro or BlackJAX, MCLMC, SMC, the Laplace approximation, and delayed
-#    acceptance, which draws from the posterior of finite elements itself.
+# 3. `cal.sample` with one of its samplers: importance sampling, NUTS of NumPyro or BlackJAX, MCLMC, SMC, the Laplace
+#    approximation, and delayed acceptance, which draws from the posterior of finite elements itself.
 #
 # At the end all are compared by effective draws a second, and by what they would cost with FEM in place of the emulator.
 
@@ -165,6 +165,7 @@ assert abs(found["noise_sd"].mean() - 0.3) < 4.0 * found["noise_sd"].std()
 # %%
 size = {"warmup": 300, "draws": 400, "chains": 4}
 OPTIONS = {
+    "importance": cal.ImportanceOptions(draws=400),
     "nuts": cal.NUTSOptions(**size, rounds=1),
     "blackjax_nuts": cal.BlackJAXNUTSOptions(**size, rounds=1),
     "mclmc": cal.MCLMCOptions(**size, rounds=1),
@@ -267,7 +268,8 @@ axes.spines[["top", "right"]].set_visible(False)
 plt.show()
 
 # %% [markdown]
-# Draws of the Laplace approximation are independent, so its rate means nothing beyond the quality of the Gaussian.
+# Draws of the Laplace approximation are independent, so its rate means nothing beyond the quality of the Gaussian. Those of
+# `importance` are resampled from weighted points: equal ones occur, and the effective number counts them once.
 #
 # ## Delayed acceptance: FEM's posterior at a few hundred solves
 #
@@ -290,8 +292,9 @@ assert solves < 0.1 * float(posteriors["nuts"].tree["sample_stats"]["n_steps"].s
 assert certificate.verdict == "accepted"
 
 # %% [markdown]
-# The certificate says for 80 solves that the emulator's draws may be used as they are. So the order of things is: NUTS with the
+# The certificate says for 80 solves that the emulator's draws may be used as they are. So the order of things is: draws with the
 # emulator; a certificate; and where it does not accept, `cal.reweight`, or delayed acceptance, or a better emulator.
 #
-# Which sampler? NUTS, unless there is a reason: `smc` for several modes or an evidence, `mclmc` for many parameters, `laplace`
-# for a first look, `delayed_acceptance` where FEM has to decide.
+# Which sampler? `auto`, the default, unless there is a reason. For up to eight unknowns it takes `importance`, which sees the
+# whole prior, finds several modes and gives the evidence; for more, `nuts`. `smc` finds several modes among many unknowns,
+# `mclmc` is for many parameters, `laplace` for a first look, `delayed_acceptance` where FEM has to decide.

@@ -45,6 +45,7 @@ QUICK = {
     "poor_emulators": "--quick",
     "published_pressure": "--quick",
     "released_networks": "--quick --published PUBLISHED",
+    "samplers": "--quick",
     "sbc": "--replicates 20 --only map",
     "sensitivity": "--quick",
     "sheep_myocardium": "--data MEASURED/ovine_myocardium --quick",

@@ -2,22 +2,28 @@
 
 Data and FEM's posterior are those of ``studies/inverse_benchmark``: the ventricle, displacements,
 strains and volume. Each forward map and sampler is made and run in a process of its own, without a
-cache of compiled programs.
+cache of compiled programs. Some posteriors are certified, too. What NUTS would take with FEM inside
+is an estimate: the gradients of the emulator's run, each at the price of FEM's.
 """
 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from studies.accuracy_vs_time.rungs import SEED, mechanics
 from studies.common.output import Case
+from studies.common.timing import per_call
 from studies.inverse_benchmark import entries, reference, tables
 from studies.inverse_benchmark.problems import PROBLEMS, data_of, model, scene_of
 from studies.inverse_benchmark.score import score
 
-from emulator.fem import Simulator, run_campaign, sobol
+import calibrate as cal
+from calibrate.statistical_model import Model
+from emulator import fem_forward
+from emulator.fem import Simulator, run_campaign, sobol, uniform
 from emulator.scenes import Scene
 from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.pod_gp import fit_reduced
@@ -26,6 +32,7 @@ from emulator.surrogates.taylor import expand
 
 PROBLEM = PROBLEMS["all_mid"]
 NUTS = entries.sampler("nuts", warmup=500, draws=1000, chains=4)
+FEM_NUTS = "FEM inside NUTS, estimated"
 
 
 def _series(order: int) -> Callable[[Scene], ForwardMap]:
@@ -48,11 +55,15 @@ def _network(scene: Scene) -> ForwardMap:  # noqa: ARG001 - it is shipped
 
 @dataclass(frozen=True)
 class Way:
-    """A forward map, made from the scene, and a sampler. before_s : of training what is loaded."""
+    """A forward map, made from the scene, and a sampler.
+
+    sampler : ``None`` for the toolkit's default, with a certificate after it.
+    before_s : seconds of training what is loaded.
+    """
 
     kind: str
     make: Callable[[Scene], ForwardMap]
-    sampler: entries.Method = NUTS
+    sampler: entries.Method | None = NUTS
     before_s: Callable[[], float] = lambda: 0.0
 
 
@@ -62,6 +73,11 @@ WAYS = {
         f"series + discrepancy, {n} FEM runs, NUTS": Way("emulator", _mechanics(n))
         for n in (5, 20, 60)
     },
+    **{
+        f"series + discrepancy, {n} FEM runs, certified": Way("emulator", _mechanics(n), None)
+        for n in (20, 60)
+    },
+    FEM_NUTS: Way("FEM", _mechanics(60)),
     **{f"POD + GP, {n} FEM runs, NUTS": Way("POD + GP", _reduced(n)) for n in (10, 30, 60)},
     "network alone, NUTS": Way("network", _network, before_s=lambda: entries.NETWORK()[1]),
     "series + discrepancy, 20 FEM runs, MCLMC": Way(
@@ -79,6 +95,17 @@ WAYS = {
 }
 
 
+def _by_fem(statistical: Model, data: entries.Draws) -> float:
+    """Return the seconds of NUTS with FEM inside: its gradients here, each as long as FEM's."""
+    options = cal.NUTSOptions(warmup=500, draws=1000, chains=4)
+    posterior = cal.sample(statistical, data, options=options, seed=3, predictions=False)
+    gradients = int(posterior.tree["sample_stats"]["n_steps"].sum())
+    by_fem = fem_forward(entries.simulator()).at(statistical.observe.nodes)
+    value = jax.value_and_grad(lambda theta: jnp.sum(by_fem(theta) ** 2))
+    scene = entries.simulator().scene
+    return gradients * per_call(value, uniform(scene, 8, jax.random.key(SEED)))
+
+
 def examine(name: str) -> Case:
     """One way: its error, and its time from the mesh and from the map."""
     way, scene = WAYS[name], scene_of()
@@ -87,18 +114,32 @@ def examine(name: str) -> Case:
     forward(jnp.asarray(scene.centre)).block_until_ready()
     offline = time.perf_counter() - began + way.before_s()
     began = time.perf_counter()
-    draws, solves = way.sampler(model(PROBLEM, forward), data_of(PROBLEM))
-    sampling = time.perf_counter() - began
+    statistical, data, after = model(PROBLEM, forward), data_of(PROBLEM), {}
+    if way.sampler:
+        draws, solves = way.sampler(statistical, data)
+        sampling = time.perf_counter() - began
+    else:
+        posterior = cal.sample(statistical, data, seed=3, predictions=False)
+        draws, sampling = posterior.draws(), time.perf_counter() - began
+        certificate = cal.certify(posterior, entries.simulator())
+        solves = certificate.evidence.physics.runs
+        after = {
+            "certifying_s": time.perf_counter() - began - sampling,
+            "verdict": certificate.verdict,
+        }
     names = scene.parameter_names
     columns = np.column_stack([draws[each] for each in names])
     table = tables.Table(columns, np.full(len(columns), 1.0 / len(columns)))
     found = score(table, tables.read(reference.path_of(PROBLEM), names))
     kept = ("sliced", "largest_shift", "largest_log_sd", "draws")
+    if name == FEM_NUTS:
+        offline, sampling = 0.0, _by_fem(statistical, data)
     return {
         "kind": way.kind,
         "posterior": name,
         "offline_s": offline,
         "sampling_s": sampling,
         "fem_solves": solves,
+        **after,
         **{key: found[key] for key in kept},
     }

@@ -1,4 +1,4 @@
-"""What an evaluation of a cached emulator costs: against FEM, by size of mesh, by what is observed.
+"""What an evaluation of a cached emulator costs: against FEM, and by size of mesh.
 
     python -m studies.decoder_speed
     python -m studies.decoder_speed --quick --out DIR    # few calls, two small cubes
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from studies.common.output import save, study_header
-from studies.decoder_speed import cubes, kinds, ventricle
+from studies.decoder_speed import cubes, ventricle
 
 from calibrate.figures import pyplot
 from emulator.core.store import write_json
@@ -105,7 +105,6 @@ def main() -> None:
         calls, fem_calls, runs, cells, order = 20, 2, 5, [2, 3], 1
     cases = ventricle.study(calls, fem_calls, runs, BATCH, SEED)
     cases += cubes.study(cells, order, max(calls // 10, 2), BATCH, SEED)
-    cases += kinds.study(1, 30, 50, SEED) if arguments.quick else kinds.study(4, 500, 2000, SEED)
     found = summary(cases)
     print("   ".join(f"{name} {value:.4g}" for name, value in found.items()), flush=True)
     arguments.out.mkdir(parents=True, exist_ok=True)

@@ -15,7 +15,7 @@ from typing import Any
 import jax
 from studies.common.output import study_header
 from studies.common.timing import milliseconds, per_call
-from studies.decoder_speed.kinds import SCENE, problem
+from studies.samplers.problems import problem
 
 import calibrate as cal
 import emulator as em
@@ -29,7 +29,7 @@ from emulator.training.plan import Job
 
 HERE = Path(__file__).parent
 SEED = 12
-OBSERVED, NOISE = "landmarks:24+volume", {"displacement": 0.3, "volume": 1.0}
+OBSERVED = "24 landmarks and volume"
 
 
 def gradients(model: Model, data: Data, size: int) -> float:
@@ -56,7 +56,7 @@ def step_s(device: jax.Device, batch: int, steps: int) -> float:
     """Seconds of a step of the paper's training, ``batch`` theta each, prepared on the CPU."""
     plan = replace(PAPER, steps=steps, batch=batch)
     with jax.default_device(jax.devices("cpu")[0]):
-        training = plan.prepare(Job(em.load(SCENE).scene)).training
+        training = plan.prepare(Job(em.load("left_ventricle").scene)).training
         state = training.initial()
     state = jax.device_put(state, device)
     advance = Steps(training)
@@ -72,7 +72,7 @@ def step_s(device: jax.Device, batch: int, steps: int) -> float:
 
 def measured(device: jax.Device, *, quick: bool) -> dict[str, Any]:
     """Times on a device; of the CPU without particles, which take it minutes."""
-    model, data = problem(OBSERVED, NOISE, SEED)
+    model, data = problem(OBSERVED, SEED)
     checked = model.check_data(data)
     found: dict[str, Any] = {"gradients_s": {}, "particles": {}, "step_s": {}}
     for size in (1, 64) if quick else (1, 64, 1024, 16384):

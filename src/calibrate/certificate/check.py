@@ -63,7 +63,7 @@ _STABILITY = 20  # draws at which the sign of the tangent is examined
 _CHAINS = 4  # chains of a reweighted posterior
 _OF_OTHER_DRAWS = (
     "log_evidence", "log_evidence_error", "pareto_k", "importance_efficiency", MISSED_BY, MISSED_AT,
-    MAP_ERRORS, "weights_pareto_k", "evaluations",
+    MAP_ERRORS, "weights_pareto_k", "evaluations", "effective_points",
 )  # fmt: skip
 
 

@@ -7,8 +7,10 @@ weighted,
 
 .. math:: w_i = \frac{p(z_i)\, L(z_i)}{q(z_i)}
 
-until they are worth the draws asked for: :math:`(\sum w_i)^2 / \sum w_i^2` of them. The draws are
-resampled from these points with probability proportional to :math:`w_i`; equal ones occur. Every
+until they are worth twice the draws asked for: :math:`n = (\sum w_i)^2 / \sum w_i^2`. The
+:math:`m` draws are resampled from these points with probability proportional to :math:`w_i`; equal
+ones occur. The variance of a mean of draws is that of the points and that of the choice among them,
+at most :math:`\sigma^2 / n + \sigma^2 / m`: the draws are worth two thirds of :math:`m` or more. Every
 weight is of the model's own density, so nothing is approximated but by the number of points. The
 mean of the weights is the evidence.
 
@@ -60,6 +62,7 @@ _FITS, _MOST_FITS = 2, 6
 _LIGHT = 0.5  # Pareto shape of the weights of a good fit: their variance is finite
 _FITTED_TO = 4096  # points, resampled, that a proposal is fitted to
 _FRESH = 2048  # points at a time from a fitted proposal
+_WORTH = 2.0  # independent draws that the points are worth, for one that is resampled from them
 _CENTRES, _WIDTHS, _FREEDOM = 512, (0.5, 1.0), 5.0  # of a fitted proposal
 
 
@@ -167,7 +170,7 @@ class _Run:
 
     def draw(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Return draws z (count, p) and their log posterior densities (count,)."""
-        while effective_number(self.points.log_weights) < count:
+        while effective_number(self.points.log_weights) < _WORTH * count:
             self._go_to(self.points.grown(self._rng), _FRESH)
         rows = resampled(normalised(self.points.log_weights), count, self._rng)
         return self.points.z[rows], self.points.log_posterior[rows]
@@ -200,7 +203,8 @@ class ImportanceSampling(Sampler):
 
         The attribute ``log_evidence`` is the logarithm of the populations' mean evidence,
         ``log_evidence_error`` its standard error, ``weights_pareto_k`` the largest Pareto shape of
-        a population's weights, ``evaluations`` those of the density in all.
+        a population's weights, ``evaluations`` those of the density in all, and
+        ``effective_points`` the number of independent draws that all points are worth.
 
         Raises
         ------
@@ -234,6 +238,7 @@ class ImportanceSampling(Sampler):
         attributes: dict[str, Any] = {
             "weights_pareto_k": float(np.max(shapes)),
             "evaluations": int(sum(run.evaluations for run in runs)),
+            "effective_points": float(sum(effective_number(r.points.log_weights) for r in runs)),
             **evidence(np.array([run.points.log_evidence for run in runs])),
         }
         return draws._replace(attributes=attributes)
