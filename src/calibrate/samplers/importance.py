@@ -10,9 +10,9 @@ weighted,
 until they are worth twice the draws asked for: :math:`n = (\sum w_i)^2 / \sum w_i^2`. The
 :math:`m` draws are resampled from these points with probability proportional to :math:`w_i`; equal
 ones occur. The variance of a mean of draws is that of the points and that of the choice among them,
-at most :math:`\sigma^2 / n + \sigma^2 / m`: the draws are worth two thirds of :math:`m` or more. Every
-weight is of the model's own density, so nothing is approximated but by the number of points. The
-mean of the weights is the evidence.
+at most :math:`\sigma^2 / n + \sigma^2 / m`: the draws are worth two thirds of :math:`m` or more.
+Every weight is of the model's own density, so nothing is approximated but by the number of points.
+The mean of the weights is the evidence.
 
 Independent populations take the place of chains: their R-hat shows whether they found the same
 posterior. Where they did not, because a mode is hard to find, each is fitted once more to the

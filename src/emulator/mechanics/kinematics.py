@@ -118,6 +118,14 @@ class Strain:
         return self._limited_I1(change * jnp.exp(power) + 3.0 * jnp.expm1(power))
 
     @property
+    def isochoric_I2_minus_3(self) -> jax.Array:
+        """``J^(-4/3) I2 - 3``, independent of volume change, shape ()."""
+        change = 2.0 * self.green_lagrange
+        trace, power = jnp.trace(change), -4.0 / 3.0 * self.ln_J
+        change = 2.0 * trace + 0.5 * (trace**2 - jnp.sum(change * change))  # I2 - 3
+        return self._limited_I1(change * jnp.exp(power) + 3.0 * jnp.expm1(power))
+
+    @property
     def isochoric_I4f_minus_1(self) -> jax.Array:
         """``J^(-2/3) f . C f - 1``: squared fibre stretch less 1, volume change taken out, ()."""
         return self._isochoric_stretch(self.fibre)

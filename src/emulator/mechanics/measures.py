@@ -26,11 +26,13 @@ _SHAPES: dict[str, tuple[int, ...]] = {
     "J_minus_1": (),
     "I1_minus_3": (),
     "isochoric_I1_minus_3": (),
+    "isochoric_I2_minus_3": (),
     "isochoric_I4f_minus_1": (),
     "isochoric_I4s_minus_1": (),
     "isochoric_I8fs": (),
     "green_lagrange": (3, 3),
 }
+_DIFFERENTIATED_BY_JAX = {"isochoric_I2_minus_3", "green_lagrange"}
 
 
 def _metric(name: str, strain: Strain) -> jax.Array:
@@ -73,6 +75,7 @@ class GivenStrain(Strain):
     J_minus_1 = _given("J_minus_1")
     I1_minus_3 = _given("I1_minus_3")
     isochoric_I1_minus_3 = _given("isochoric_I1_minus_3")
+    isochoric_I2_minus_3 = _given("isochoric_I2_minus_3")
     isochoric_I4f_minus_1 = _given("isochoric_I4f_minus_1")
     isochoric_I4s_minus_1 = _given("isochoric_I4s_minus_1")
     isochoric_I8fs = _given("isochoric_I8fs")
@@ -143,7 +146,7 @@ class Measures:
         :math:`J_{,ij} = J G_{ij}`, :math:`J_{,ijkl} = J (G_{ij} G_{kl} - G_{il} G_{kj})`. Other
         measures are differentiated by JAX.
         """
-        if "green_lagrange" in self.names:
+        if _DIFFERENTIATED_BY_JAX & set(self.names):
             measures = lambda H: self.of(H, directions)  # noqa: E731
             pulled_back = lambda H: jax.vjp(measures, H)[1](s)[0]  # noqa: E731
             return jax.jacfwd(measures)(H), jax.jacfwd(pulled_back)(H)

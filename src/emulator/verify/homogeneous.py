@@ -159,11 +159,90 @@ def guccione(stretches: np.ndarray, values: Values) -> np.ndarray:
     return matrix + values["kappa"] * (J - 1.0) * J / stretches
 
 
+def _small_volume(stretches: np.ndarray, kappa: float) -> np.ndarray:
+    """Return the stresses of kappa/4 (J^2 - 1 - 2 ln J)."""
+    return 0.5 * kappa * (np.prod(stretches) ** 2 - 1.0) / stretches
+
+
+def polynomial(stretches: np.ndarray, values: Values) -> np.ndarray:
+    r"""Powers of the first isochoric invariant, and the second.
+
+    .. math::
+        P_i = \sum_k k c_k (\bar I_1 - 3)^{k-1} \partial_i \bar I_1 + c_{01}\, \partial_i \bar I_2
+    """
+    I1, d_I1 = _isochoric(stretches, np.ones(3))
+    powers = {
+        1: values.get("c_1", values.get("c_10", 0.0)),
+        **{k: values.get(f"c_{k}", 0.0) for k in (2, 3)},
+    }
+    stress = sum(k * c * (I1 - 3.0) ** (k - 1) for k, c in powers.items()) * d_I1
+    squares = stretches**2
+    I2, scale = np.prod(squares) * np.sum(1.0 / squares), np.prod(stretches) ** (-4.0 / 3.0)
+    d_I2 = scale * (2.0 * stretches * (np.sum(squares) - squares) - 4.0 / 3.0 * I2 / stretches)
+    return stress + values.get("c_01", 0.0) * d_I2 + _small_volume(stretches, values["kappa"])
+
+
+def ogden(stretches: np.ndarray, values: Values) -> np.ndarray:
+    r"""Powers of the isochoric stretches, less the mean of the three.
+
+    .. math:: P_i = \sum_p \frac{2\mu_p}{\alpha_p \lambda_i}
+        \Big(\bar\lambda_i^{\alpha_p} - \tfrac13 \sum_k \bar\lambda_k^{\alpha_p}\Big)
+    """
+    isochoric = stretches * np.prod(stretches) ** (-1.0 / 3.0)
+    stress = _small_volume(stretches, values["kappa"])
+    for k in range(1, 4):
+        if f"mu_{k}" in values:
+            powers = isochoric ** values[f"alpha_{k}"]
+            factor = 2.0 * values[f"mu_{k}"] / values[f"alpha_{k}"]
+            stress = stress + factor * (powers - powers.mean()) / stretches
+    return stress
+
+
+def fung(stretches: np.ndarray, values: Values) -> np.ndarray:
+    r"""Fibres along x, sheets along y: :math:`P_i = C e^Q (B E)_i \lambda_i` and a matrix."""
+    b = {k: values.get(f"b_{k}", 0.0) for k in range(1, 7)}
+    B = np.array([[b[1], b[4], b[6]], [b[4], b[2], b[5]], [b[6], b[5], b[3]]])
+    E = (stretches**2 - 1.0) / 2.0
+    stress = values["C"] * np.exp(E @ B @ E) * (B @ E) * stretches
+    matrix = 0.5 * values["mu"] * _isochoric(stretches, np.ones(3))[1]
+    return stress + matrix + _small_volume(stretches, values["kappa"])
+
+
+def two_families(stretches: np.ndarray, values: Values) -> np.ndarray:
+    """Two families of fibres at an angle from x in the plane of x and y, which do not shear."""
+    d, beta = values.get("dispersion", 0.0), np.deg2rad(values["angle"])
+    weights = d + (1.0 - 3.0 * d) * np.array([np.cos(beta) ** 2, np.sin(beta) ** 2, 0.0])
+    measure, slope = _isochoric(stretches, weights)
+    x = max(measure - 1.0, 0.0)
+    fibres = 2.0 * values["k_1"] * x * np.exp(values["k_2"] * x**2) * slope
+    matrix = 0.5 * values["c"] * _isochoric(stretches, np.ones(3))[1]
+    return matrix + fibres + _small_volume(stretches, values["kappa"])
+
+
+def may_newman(stretches: np.ndarray, values: Values) -> np.ndarray:
+    """Fibres along x."""
+    I1, d_I1 = _isochoric(stretches, np.ones(3))
+    I4, d_I4 = _isochoric(stretches, np.array([1.0, 0.0, 0.0]))
+    x, y = I1 - 3.0, np.sqrt(I4) - 1.0
+    Q = values["c_1"] * x**2 + values["c_2"] * y**4
+    slope = 2.0 * values["c_1"] * x * d_I1 + 2.0 * values["c_2"] * y**3 / np.sqrt(I4) * d_I4
+    stress = values["c_0"] * np.exp(Q) * slope + 0.5 * values["mu"] * d_I1
+    return stress + _small_volume(stretches, values["kappa"])
+
+
 _unswitched = partial(holzapfel_ogden, switch=False)
 _FIBRES = {"a": 2.0, "b": 3.0, "a_f": 5.0, "b_f": 4.0}
 _SHEETS = {"a_s": 3.0, "b_s": 4.0, "a_fs": 1.0, "b_fs": 2.0}
 _RELEASED = {"a": 1.0, "b": 3.0, "a_f": 2.5, "b_f": 4.0}
 _DISPERSED = {**_FIBRES, "dispersion": 0.1, "kappa": 50.0}
+_OGDEN = {"mu_1": 2.0, "alpha_1": 1.5, "mu_2": 1.0, "alpha_2": -3.0, "mu_3": 0.5, "alpha_3": 8.0}
+_MATRIX = {"mu": 1.0, "kappa": 50.0}
+_FUNG = dict(
+    zip(
+        (f"b_{k}" for k in range(1, 10)), (8.0, 4.0, 3.0, 2.0, 1.0, 1.5, 3.0, 2.0, 2.5), strict=True
+    )
+)
+_FAMILIES = {"c": 3.0, "k_1": 2.0, "k_2": 2.5, "angle": 40.0}
 SOLUTIONS: dict[str, tuple[Callable[[np.ndarray, Values], np.ndarray], dict[str, float]]] = {
     "neo_hookean": (neo_hookean, {"mu": 10.0, "lam": 30.0}),
     "neo_hookean_E_nu": (neo_hookean, {"E": 30.0, "nu": 0.4}),
@@ -178,6 +257,16 @@ SOLUTIONS: dict[str, tuple[Callable[[np.ndarray, Values], np.ndarray], dict[str,
     "holzapfel_ogden_released": (holzapfel_ogden_released, {**_RELEASED, "kappa": 50.0}),
     "holzapfel_ogden_orthotropic": (holzapfel_ogden, {**_FIBRES, **_SHEETS, "kappa": 50.0}),
     "guccione": (guccione, {"C": 2.0, "b_f": 8.0, "b_t": 2.0, "b_fs": 4.0, "kappa": 50.0}),
+    "mooney_rivlin": (polynomial, {"c_10": 2.0, "c_01": 1.0, "kappa": 40.0}),
+    "yeoh": (polynomial, {"c_1": 2.0, "c_2": 0.5, "c_3": 0.3, "kappa": 40.0}),
+    "ogden_1": (ogden, {"mu_1": 3.0, "alpha_1": 5.0, "kappa": 40.0}),
+    "ogden_2": (ogden, {"mu_1": 3.0, "alpha_1": 5.0, "mu_2": 1.0, "alpha_2": -2.0, "kappa": 40.0}),
+    "ogden_3": (ogden, {**_OGDEN, "kappa": 40.0}),
+    "fung_planar": (fung, {"C": 2.0, "b_1": 8.0, "b_2": 4.0, "b_4": 2.0, "b_7": 3.0, **_MATRIX}),
+    "fung_orthotropic": (fung, {"C": 2.0, **_FUNG, **_MATRIX}),
+    "holzapfel_gasser_ogden": (two_families, {**_FAMILIES, "kappa": 25.0}),
+    "gasser_ogden_holzapfel": (two_families, {**_FAMILIES, "dispersion": 0.1, "kappa": 25.0}),
+    "may_newman": (may_newman, {"c_0": 0.5, "c_1": 2.0, "c_2": 8.0, **_MATRIX}),
 }
 """Principal stresses of each law, and parameters, by which every term of the law contributes and
 volume changes are resisted as in tissue."""

@@ -42,7 +42,7 @@ def test_a_law_of_the_gradient_reads_no_measures():
             "isochoric_I1_minus_3",
             "isochoric_I4f_minus_1",
         ),
-        ("green_lagrange", "J_minus_1"),
+        ("green_lagrange", "isochoric_I2_minus_3", "J_minus_1"),
     ],
     ids=["plain", "isochoric", "tensor"],
 )
