@@ -50,6 +50,7 @@ def check_magnitudes(
     sd: Mapping[str, float],
     draws: np.ndarray,
     data: Mapping[str, np.ndarray],
+    predictions: Mapping[str, np.ndarray],
 ) -> None:
     """Raise :class:`InputError` where ``data`` is far from every prediction.
 
@@ -58,8 +59,8 @@ def check_magnitudes(
     sd : the largest plausible sd of each observation's noise and other errors, in its unit.
     draws : draws of the unknowns' prior, (c, q), ``PRIOR_DRAWS`` of them or so.
     data : the data by observation.
+    predictions : those of :func:`predict_over_prior`, by observation.
     """
-    predictions = predict_over_prior(predict, observe, draws)
     for name, part in observe.parts.items():
         if complaint(name, part, data[name], predictions[name], sd[name]) is None:
             continue

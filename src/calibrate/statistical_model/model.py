@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import jax
@@ -27,7 +27,7 @@ from numpyro import handlers
 
 from calibrate import mend_numpyro
 from calibrate.measurements import Observation, Observations, leave_out_missing, observations
-from calibrate.measurements.magnitude import PRIOR_DRAWS, check_magnitudes
+from calibrate.measurements.magnitude import PRIOR_DRAWS, check_magnitudes, predict_over_prior
 from calibrate.model_error import ModelError
 from calibrate.noise import Noise
 from calibrate.priors import Dependence, Prior, dependence_of
@@ -216,6 +216,10 @@ class Model:
         prediction = self.evaluate(thetas)
         return self.observe(prediction.displacement, thetas), prediction.valid
 
+    def predict_stacked(self, values: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
+        """Return :meth:`predict` of values (q,) in the order of the unknowns."""
+        return self.predict(dict(zip(self.states.unknowns, values, strict=True)))
+
     def distributions(self, draw: Mapping[str, Any], means: Data) -> dict[str, dist.Distribution]:
         """Return the distribution of each observation's data around its mean, by name.
 
@@ -302,14 +306,9 @@ class Model:
                     "missing (NaN); Model.given leaves them out"
                 )
         if self.check_scale:
-            unknowns = self.states.unknowns
-            draws = jax.jit(lambda key: self.prior_draws(key, PRIOR_DRAWS))(jax.random.key(0))
-            stacked = np.stack([np.asarray(draws[name]) for name in unknowns], axis=1)
-
-            def predict(values: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
-                return self.predict(dict(zip(unknowns, values, strict=True)))
-
-            check_magnitudes(predict, self.observe, self._largest_sds(named), stacked, named)
+            draws, predictions = _before_data(self)
+            predict, sds = self.predict_stacked, self._largest_sds(named)
+            check_magnitudes(predict, self.observe, sds, draws, named, predictions)
         return {name: jnp.asarray(values) for name, values in named.items()}
 
     def _largest_sds(self, data: Mapping[str, np.ndarray]) -> dict[str, float]:
@@ -339,6 +338,14 @@ class Model:
                 named[name] = named[name].reshape(())
             part.check(name, named[name])
         return named
+
+
+@lru_cache(maxsize=4)
+def _before_data(model: Model) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return draws (c, q) of the unknowns' prior, and predictions over it, by observation."""
+    draws = jax.jit(lambda key: model.prior_draws(key, PRIOR_DRAWS))(jax.random.key(0))
+    stacked = np.stack([np.asarray(draws[name]) for name in model.states.unknowns], axis=1)
+    return stacked, predict_over_prior(model.predict_stacked, model.observe, stacked)
 
 
 def model(
