@@ -21,7 +21,7 @@ INFER = [words for block in BLOCKS for words in block if words[0] == "infer"]
 
 
 # By the --out of the command; all others are accepted.
-REFUSED = dict.fromkeys(("isotropic", "liver", "infarct"), "not certified")
+REFUSED = dict.fromkeys(("isotropic", "liver", "strains", "infarct"), "not certified")
 
 
 def name(words):

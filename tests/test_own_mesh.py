@@ -36,10 +36,10 @@ def all_the_way(capsys, mesh, truth, observe, noise):
         capsys, "infer", scene, "--emulator", trained, "--truth", *truth, "--observe", observe,
         "--noise", *noise, *sizes, "--no-certify", "--out", found,
     )  # fmt: skip
-    # Exit code 1 where it is not accepted: on a mesh this coarse 21 FEM runs may leave too much.
+    # Exit code 1 where it is not accepted: on a mesh this coarse a finer one may move a mean.
     code = main(["certify", str(found), "--json"])
     verdict = json.loads(capsys.readouterr().out)["verdict"]
-    assert verdict in ({"accepted"} if code == 0 else {"reweight", "undecided"})
+    assert verdict in ({"accepted"} if code == 0 else {"reweight", "undecided", "not certified"})
     page = Path(told(capsys, "report", found)["out"]).read_text(encoding="utf-8")
     assert f"<b>{verdict}</b>" in page
 

@@ -319,6 +319,8 @@ def judge(evidence: Evidence) -> Certificate:
         verdict = "undecided"
     if wrong_map and (faults or not agrees):  # then chains are no fault of the sampler
         faults = [wrong_map, *((words, "mend the map first") for words, _ in faults)]
+    elif wrong_map and verdict == "reweight":
+        agreement = [*agreement, wrong_map]
     faults += others
     if evidence.mesh.why and verdict == "accepted":
         agreement = [(f"{agreement[0][0]} on this mesh", "")]

@@ -54,7 +54,7 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.fem.assembly import System
-from emulator.fem.compiled import compiled, cond, is_traced, while_loop
+from emulator.fem.compiled import compiled, cond, is_traced, one_by_one, while_loop
 from emulator.fem.energy import at_points, displacement_gradient, require_shape, volume_ratio
 from emulator.fem.formulations.displacement import UNBALANCED
 from emulator.fem.linear import Outcome
@@ -346,13 +346,18 @@ class ErrorBar:
         require_shape(self.scene, "theta", theta, (len(self.scene.parameters),))
         require_shape(self.scene, "displacement", u, self.scene.held.shape)
         state, safe_theta = self._prepare(u, theta)
-        step = self._step(state, safe_theta)
-        distance = cond(
+        # Under vmap one after the other: side by side, FEM would run for accepted steps, too.
+        measure = one_by_one(self._distance) if is_traced(u, theta) else self._distance
+        return self._finish(u, theta, state, measure(state, safe_theta))
+
+    def _distance(self, state: jax.Array, theta: jax.Array) -> Distance:
+        """Return the distance to equilibrium: by one step of Newton, or by FEM."""
+        step = self._step(state, theta)
+        return cond(
             step.accepted,
             lambda: step,
-            lambda: self._by_fem(state, safe_theta)._replace(indefinite=step.indefinite),
+            lambda: self._by_fem(state, theta)._replace(indefinite=step.indefinite),
         )
-        return self._finish(u, theta, state, distance)
 
 
 def _report(
