@@ -119,8 +119,9 @@ def check(cases: list[Case]) -> None:
     assert max(z) < 4.0, max(z)
     assert np.mean(np.array(z) > 3.0) < 0.05
     for case in cases:
-        others = [rate(case, way) for way in COLOURS if way not in OURS]
-        assert max(rate(case, way) for way in OURS) > max(others), case["name"]
+        if case["name"] in OBSERVED:
+            others = [rate(case, way) for way in COLOURS if way not in OURS]
+            assert rate(case, "importance") > max(others), case["name"]
 
 
 def main() -> None:
@@ -128,7 +129,7 @@ def main() -> None:
     words = parser(__doc__, HERE)
     words.add_argument("--only", nargs="+", choices=tuple(PROBLEMS), help="posteriors to sample")
     words.add_argument("--draws", type=int, default=500, help="draws of each of four chains")
-    words.add_argument("--points", type=int, default=200_000, help="points of the reference")
+    words.add_argument("--points", type=int, default=100_000, help="points of the reference")
     words.add_argument("--part", help="print one posterior's case as JSON; for the study itself")
     arguments = words.parse_args()
     size = {"draws": arguments.draws, "points": arguments.points}

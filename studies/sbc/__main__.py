@@ -1,4 +1,4 @@
-"""Simulation-based calibration of the shipped emulators, their noise models and sampler.
+"""Simulation-based calibration of the shipped emulators, their noise models and NUTS.
 
 ``python -m studies.sbc [--replicates N] [--only NAME ...]``. FEM makes the data, the emulator's
 posterior is ranked. Writes results.json and a figure a case beside itself, or under --out, after
@@ -19,6 +19,7 @@ import calibrate as cal
 from calibrate.analysis.sbc import Calibration, sbc
 from calibrate.figures.sensitivity import draw_calibration
 from calibrate.project import Run, by_fem, model_before_data
+from calibrate.samplers import NUTSOptions
 from calibrate.statistical_model import Model
 from emulator.core.store import read_json, write_json
 
@@ -87,7 +88,7 @@ def examine(name: str, replicates: int, out: Path) -> dict[str, Any]:
     """Ranks of one case, with its figure."""
     case, began = CASES[name], time.process_time()
     model = model_before_data(case.run)
-    options = cal.AutoOptions(draws=250, chains=2, rounds=1)
+    options = NUTSOptions(200, 250, 2, rounds=1)
     found: Calibration = sbc(model, replicates, truth=case.truth(model), options=options, seed=SEED)
     draw_calibration(found, case.title, out / f"{name}.png")
     result = found.to_json()
