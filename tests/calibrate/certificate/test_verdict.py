@@ -160,10 +160,15 @@ def test_a_wrong_map_is_named_before_the_chains_that_disagree_on_it():
     assert certificate.to_json()["map_errors"] == wrong
 
 
-def test_a_wrong_map_is_not_named_where_fem_repairs_it_and_decides_nothing_by_itself():
+def test_a_wrong_map_is_named_last_where_fem_repairs_it_and_decides_nothing_by_itself():
     wrong = {"x": 2.0}
     assert judge(replace(RIGHT, map_errors=wrong)).findings == judge(RIGHT).findings
-    assert "map" not in verdict(map_errors=wrong, draws=changes(0.6))[1]
+    moved = judge(replace(RIGHT, map_errors=wrong, draws=changes(0.6)))
+    alone = judge(replace(RIGHT, draws=changes(0.6)))
+    assert moved.verdict == alone.verdict == "reweight"
+    assert moved.findings[0] == alone.findings[0]
+    (named,) = set(moved.findings) - set(alone.findings)
+    assert named.startswith("the forward map misses FEM by 2 noise sd in x")
     open_ = judge(replace(RIGHT, map_errors=wrong, draws=changes(0.25, error=0.04)))
     assert (open_.verdict, open_.findings[0][:22]) == ("undecided", "the forward map misses")
     assert "R-hat 1.500: draw more" in " ".join(
