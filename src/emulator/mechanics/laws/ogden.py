@@ -95,7 +95,7 @@ def _logarithm(pair: Pair) -> Pair:
     """Return the traces of the logarithm's square and cube."""
     x, y = _repeated(_halved, pair, _HALVINGS)
     even, odd = x + y, x - y
-    # The series inverted; what is left out is below 1e-17 for stretches from 1/8 to 8.
+    # The series inverted; what is left out is below 1e-13 of each for stretches from 1/8 to 8.
     p2 = even - even**2 / 24.0 + even**3 / 360.0 - odd**2 / 120.0
     p2 += even * odd**2 / 840.0 - even**4 / 4480.0
     p3 = 3.0 * odd * (1.0 - even / 24.0 + even**2 / 360.0)
