@@ -2,28 +2,23 @@
 
 Data and FEM's posterior are those of ``studies/inverse_benchmark``: the ventricle, displacements,
 strains and volume. Each forward map and sampler is made and run in a process of its own, without a
-cache of compiled programs. Some posteriors are certified, too. What NUTS would take with FEM inside
-is an estimate: the gradients of the emulator's run, each at the price of FEM's.
+cache of compiled programs. Some posteriors are certified, too.
 """
 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from studies.accuracy_vs_time.rungs import SEED, mechanics
 from studies.common.output import Case
-from studies.common.timing import per_call
 from studies.inverse_benchmark import entries, reference, tables
 from studies.inverse_benchmark.problems import PROBLEMS, data_of, model, scene_of
 from studies.inverse_benchmark.score import score
 
 import calibrate as cal
-from calibrate.statistical_model import Model
-from emulator import fem_forward
-from emulator.fem import Simulator, run_campaign, sobol, uniform
+from emulator.fem import Simulator, run_campaign, sobol
 from emulator.scenes import Scene
 from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.pod_gp import fit_reduced
@@ -32,7 +27,6 @@ from emulator.surrogates.taylor import expand
 
 PROBLEM = PROBLEMS["all_mid"]
 NUTS = entries.sampler("nuts", warmup=500, draws=1000, chains=4)
-FEM_NUTS = "FEM inside NUTS, estimated"
 
 
 def _series(order: int) -> Callable[[Scene], ForwardMap]:
@@ -77,7 +71,6 @@ WAYS = {
         f"series + discrepancy, {n} FEM runs, certified": Way("emulator", _mechanics(n), None)
         for n in (20, 60)
     },
-    FEM_NUTS: Way("FEM", _mechanics(60)),
     **{f"POD + GP, {n} FEM runs, NUTS": Way("POD + GP", _reduced(n)) for n in (10, 30, 60)},
     "network alone, NUTS": Way("network", _network, before_s=lambda: entries.NETWORK()[1]),
     "series + discrepancy, 20 FEM runs, MCLMC": Way(
@@ -93,17 +86,6 @@ WAYS = {
         "FEM", _mechanics(5), entries.sampler("delayed_acceptance")
     ),
 }
-
-
-def _by_fem(statistical: Model, data: entries.Draws) -> float:
-    """Return the seconds of NUTS with FEM inside: its gradients here, each as long as FEM's."""
-    options = cal.NUTSOptions(warmup=500, draws=1000, chains=4)
-    posterior = cal.sample(statistical, data, options=options, seed=3, predictions=False)
-    gradients = int(posterior.tree["sample_stats"]["n_steps"].sum())
-    by_fem = fem_forward(entries.simulator()).at(statistical.observe.nodes)
-    value = jax.value_and_grad(lambda theta: jnp.sum(by_fem(theta) ** 2))
-    scene = entries.simulator().scene
-    return gradients * per_call(value, uniform(scene, 8, jax.random.key(SEED)))
 
 
 def examine(name: str) -> Case:
@@ -132,8 +114,6 @@ def examine(name: str) -> Case:
     table = tables.Table(columns, np.full(len(columns), 1.0 / len(columns)))
     found = score(table, tables.read(reference.path_of(PROBLEM), names))
     kept = ("sliced", "largest_shift", "largest_log_sd", "draws")
-    if name == FEM_NUTS:
-        offline, sampling = 0.0, _by_fem(statistical, data)
     return {
         "kind": way.kind,
         "posterior": name,

@@ -157,7 +157,7 @@ def _exit(x: np.ndarray, d: np.ndarray, wider: np.ndarray, farthest: float) -> _
     share = np.bincount(first[near], minlength=len(d)) / near.sum()
     numbers = np.flatnonzero(moves)
     ends = tuple((int(numbers[k]), bool(high[k])) for k in np.flatnonzero(share >= _OFTEN))
-    # Where draws at the exit stand along d: a line through positions over distances, at distance 0.
+    # A line through positions over distances says, at distance 0, where draws at the exit stand.
     position = x @ d
     t_near, p_near = t[near] - t[near].mean(), position[near]
     slope = float(t_near @ p_near) / max(float(t_near @ t_near), np.finfo(float).tiny)

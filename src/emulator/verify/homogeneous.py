@@ -98,9 +98,14 @@ def _lame(values: Values) -> tuple[float, float]:
     return E / 2.0 / (1.0 + nu), E * nu / (1.0 + nu) / (1.0 - 2.0 * nu)
 
 
+def _volume(stretches: np.ndarray, kappa: float) -> np.ndarray:
+    """Return the stresses of kappa/4 (J^2 - 1 - 2 ln J)."""
+    return 0.5 * kappa * (np.prod(stretches) ** 2 - 1.0) / stretches
+
+
 def neo_hookean_split(stretches: np.ndarray, values: Values) -> np.ndarray:
     r""":math:`P_i = \tfrac{\mu}{2} \partial_i \bar I_1 + \tfrac{\kappa}{2}(J^2 - 1)/\lambda_i`."""
-    volume = 0.5 * values["kappa"] * (np.prod(stretches) ** 2 - 1.0) / stretches
+    volume = _volume(stretches, values["kappa"])
     return 0.5 * values["mu"] * _isochoric(stretches, np.ones(3))[1] + volume
 
 
@@ -130,7 +135,7 @@ def holzapfel_ogden(stretches: np.ndarray, values: Values, *, switch: bool = Tru
     """
     a, b, kappa, d = (values.get(name, 0.0) for name in ("a", "b", "kappa", "dispersion"))
     I1, d_I1 = _isochoric(stretches, np.ones(3))
-    volume = 2.0 * kappa * (np.prod(stretches) ** 2 - 1.0) / stretches
+    volume = _volume(stretches, 4.0 * kappa)
     stress = a / 2.0 * np.exp(b * (I1 - 3.0)) * d_I1 + volume
     for k, direction in zip("fs", np.eye(3), strict=False):
         if f"a_{k}" in values:
@@ -159,11 +164,6 @@ def guccione(stretches: np.ndarray, values: Values) -> np.ndarray:
     return matrix + values["kappa"] * (J - 1.0) * J / stretches
 
 
-def _small_volume(stretches: np.ndarray, kappa: float) -> np.ndarray:
-    """Return the stresses of kappa/4 (J^2 - 1 - 2 ln J)."""
-    return 0.5 * kappa * (np.prod(stretches) ** 2 - 1.0) / stretches
-
-
 def polynomial(stretches: np.ndarray, values: Values) -> np.ndarray:
     r"""Powers of the first isochoric invariant, and the second.
 
@@ -179,7 +179,7 @@ def polynomial(stretches: np.ndarray, values: Values) -> np.ndarray:
     squares = stretches**2
     I2, scale = np.prod(squares) * np.sum(1.0 / squares), np.prod(stretches) ** (-4.0 / 3.0)
     d_I2 = scale * (2.0 * stretches * (np.sum(squares) - squares) - 4.0 / 3.0 * I2 / stretches)
-    return stress + values.get("c_01", 0.0) * d_I2 + _small_volume(stretches, values["kappa"])
+    return stress + values.get("c_01", 0.0) * d_I2 + _volume(stretches, values["kappa"])
 
 
 def ogden(stretches: np.ndarray, values: Values) -> np.ndarray:
@@ -189,7 +189,7 @@ def ogden(stretches: np.ndarray, values: Values) -> np.ndarray:
         \Big(\bar\lambda_i^{\alpha_p} - \tfrac13 \sum_k \bar\lambda_k^{\alpha_p}\Big)
     """
     isochoric = stretches * np.prod(stretches) ** (-1.0 / 3.0)
-    stress = _small_volume(stretches, values["kappa"])
+    stress = _volume(stretches, values["kappa"])
     for k in range(1, 4):
         if f"mu_{k}" in values:
             powers = isochoric ** values[f"alpha_{k}"]
@@ -205,7 +205,7 @@ def fung(stretches: np.ndarray, values: Values) -> np.ndarray:
     E = (stretches**2 - 1.0) / 2.0
     stress = values["C"] * np.exp(E @ B @ E) * (B @ E) * stretches
     matrix = 0.5 * values["mu"] * _isochoric(stretches, np.ones(3))[1]
-    return stress + matrix + _small_volume(stretches, values["kappa"])
+    return stress + matrix + _volume(stretches, values["kappa"])
 
 
 def two_families(stretches: np.ndarray, values: Values) -> np.ndarray:
@@ -216,7 +216,7 @@ def two_families(stretches: np.ndarray, values: Values) -> np.ndarray:
     x = max(measure - 1.0, 0.0)
     fibres = 2.0 * values["k_1"] * x * np.exp(values["k_2"] * x**2) * slope
     matrix = 0.5 * values["c"] * _isochoric(stretches, np.ones(3))[1]
-    return matrix + fibres + _small_volume(stretches, values["kappa"])
+    return matrix + fibres + _volume(stretches, values["kappa"])
 
 
 def may_newman(stretches: np.ndarray, values: Values) -> np.ndarray:
@@ -227,7 +227,7 @@ def may_newman(stretches: np.ndarray, values: Values) -> np.ndarray:
     Q = values["c_1"] * x**2 + values["c_2"] * y**4
     slope = 2.0 * values["c_1"] * x * d_I1 + 2.0 * values["c_2"] * y**3 / np.sqrt(I4) * d_I4
     stress = values["c_0"] * np.exp(Q) * slope + 0.5 * values["mu"] * d_I1
-    return stress + _small_volume(stretches, values["kappa"])
+    return stress + _volume(stretches, values["kappa"])
 
 
 _unswitched = partial(holzapfel_ogden, switch=False)

@@ -11,6 +11,7 @@ from jax.scipy.stats import norm
 import calibrate as cal
 from calibrate.posterior.diagnosis import diagnose
 from calibrate.samplers import Density, ImportanceOptions, density_of, find_sampler
+from calibrate.samplers.diagnostics import normalised
 from calibrate.samplers.importance import (
     AUTO,
     IMPORTANCE,
@@ -18,7 +19,7 @@ from calibrate.samplers.importance import (
     SAMPLED_BY,
     AutoOptions,
 )
-from calibrate.samplers.proposals import Kernels, separate
+from calibrate.samplers.proposals import Kernels, effective_number, resampled, separate
 from calibrate.samplers.protocol import Context
 from emulator.core.errors import InputError, SolverError
 from emulator.surrogates.fem import fem_forward
@@ -80,6 +81,21 @@ def test_narrow_modes_far_apart_in_five_dimensions(seed):
     white = (draws.z[first] - np.asarray(centres[0])) @ np.asarray(whiten).T
     np.testing.assert_allclose(white.std(axis=0), 1.0, atol=0.12)
     assert draws.attributes["weights_pareto_k"] < 0.7
+    assert draws.attributes["effective_points"] >= 2.0 * draws.z[..., 0].size
+
+
+def test_draws_of_points_that_are_worth_twice_as_many_are_worth_two_thirds():
+    """The spread of means over sets of weighted points: sigma^2 (1 / n + 1 / m) at most."""
+    rng, count = np.random.default_rng(3), 100
+    means, worth = [], []
+    for _ in range(4000):
+        z, log_weights = rng.normal(size=(2, 540))
+        worth.append(effective_number(log_weights))
+        means.append(z[resampled(normalised(log_weights), count, rng)].mean())
+    n = np.mean(worth)
+    assert n == pytest.approx(2.0 * count, rel=0.05)
+    # Less than the bound: the choice is systematic, and takes no light point twice.
+    assert 1.0 < count * np.var(means) < 1.0 + count / n
 
 
 def test_a_sheet_that_is_bent_and_cut_by_the_box(beam):
