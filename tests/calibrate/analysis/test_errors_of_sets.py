@@ -138,16 +138,19 @@ def test_sds_are_those_of_posteriors_whose_share_is_inferred():
     assert np.mean(sds) > 0.05
 
 
-def test_errors_of_no_size_change_nothing():
+@pytest.mark.parametrize(
+    ("at", "share"),
+    [({"mu": 60.0, "lam": 80.0}, 1e-9), pytest.param(None, 0.0, marks=pytest.mark.slow)],
+)
+def test_errors_of_no_size_change_nothing(at, share):
     model = displacements(BOTH)
-    for at, share in ((None, 0.0), ({"mu": 60.0, "lam": 80.0}, 1e-9)):
-        bare = expected_precision(model, at, data_sets=4)["sd"]
-        words = {"e": {**GAIN, "share": share}}
-        found = expected_precision(model, at, systematic=words, data_sets=4)["sd"]
-        assert found == pytest.approx(bare, rel=1e-12)
+    bare = expected_precision(model, at, data_sets=4)["sd"]
+    words = {"e": {**GAIN, "share": share}}
+    found = expected_precision(model, at, systematic=words, data_sets=4)["sd"]
+    assert found == pytest.approx(bare, rel=1e-12)
 
 
-@pytest.mark.parametrize("nodes", [[3], list(range(20))])
+@pytest.mark.parametrize("nodes", [pytest.param([3], marks=pytest.mark.slow), list(range(20))])
 def test_a_gain_of_ten_percent_leaves_ten_percent_however_many_points(nodes):
     """A scale of all data, beside noise of a thousandth of it."""
     matrix = FORWARD.matrix.copy()

@@ -274,7 +274,10 @@ def scale(count: int, sd: float):
     "words",
     [
         {"kind": "gain", "of": "parameter:lam", "share": 0.1},
-        {"kind": "curve", "of": "parameter:lam", "along": "mu", "length": 1e4, "share": 0.1},
+        pytest.param(
+            {"kind": "curve", "of": "parameter:lam", "along": "mu", "length": 1e4, "share": 0.1},
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_a_scale_of_sixty_numbers_is_not_fitted_too_low(words):

@@ -59,7 +59,8 @@ def test_two_modes_that_nuts_gets_wrong_have_their_shares(two_modes):
     assert posterior.warnings() == []
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.slow
 def test_narrow_modes_far_apart_in_five_dimensions(seed):
     """Shares 0.3 and 0.7, sds a hundredth of the prior's, in correlated coordinates."""
     root = np.linalg.cholesky(0.04**2 * (0.5 * np.eye(5) + 0.5))
@@ -116,7 +117,7 @@ def test_a_sheet_that_is_bent_and_cut_by_the_box(beam):
         assert draws.std() == pytest.approx(sd, rel=0.05)
 
 
-@pytest.mark.parametrize("size", [1, 8])
+@pytest.mark.parametrize("size", [1, pytest.param(8, marks=pytest.mark.slow)])
 def test_a_gaussian_of_as_few_and_as_many_unknowns_as_it_is_taken_for(size):
     mean, sd = np.linspace(-2.0, 2.0, size), 0.3
     draws = sampled(density(lambda z: norm.logpdf(z, jnp.asarray(mean), sd).sum(), size))

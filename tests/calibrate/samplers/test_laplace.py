@@ -47,6 +47,7 @@ def test_of_a_gaussian_posterior_it_is_exact(beam):
     assert posterior.warnings() == []
 
 
+@pytest.mark.slow
 def test_the_ratio_of_a_gaussian_is_its_evidence(beam):
     """log p(z, y) - log q(z) is log p(y) where q is the posterior: SMC's estimate of it."""
     model, data = linear_problem(beam)

@@ -43,6 +43,7 @@ def test_a_few_steps_find_what_a_solve_on_the_finer_mesh_finds(coarse, error):
         assert wrong < 0.05 * float(told.err_u.max())
 
 
+@pytest.mark.slow
 def test_effectivity(coarse, error):
     """Beside a mesh so fine that its own error does not count."""
     told = error(coarse.centre)

@@ -139,7 +139,7 @@ def test_a_scene_without_stress_iterates_goes_from_the_start_to_rest(beam, simul
     np.testing.assert_allclose(state.newton.u, simulator(theta), atol=1e-8)
 
 
-@pytest.mark.parametrize("pressure", [0.0, 1e-13])
+@pytest.mark.parametrize("pressure", [pytest.param(0.0, marks=pytest.mark.slow), 1e-13])
 def test_a_ventricle_without_pressure_rests(ventricle_simulator, inside_jit, pressure):
     theta = ventricle_simulator.scene.centre
     u = ventricle_simulator(theta)

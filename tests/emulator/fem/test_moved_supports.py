@@ -212,6 +212,7 @@ def sliding(law, parameters, constants, supports):
     )
 
 
+@pytest.mark.slow
 def test_a_stretch_with_sliding_plates_in_closed_form():
     """Uniaxial: lateral stretch of zero stress by bisection, force by the law's own derivative."""
     supports = (

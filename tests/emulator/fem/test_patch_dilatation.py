@@ -98,12 +98,13 @@ def test_patches_do_not_depend_on_the_list_of_elements(body):
     np.testing.assert_allclose(*residuals, atol=1e-12 * float(jnp.abs(residuals[0]).max()))
 
 
+@pytest.mark.slow
 def test_a_hundred_thousand_tetrahedra_take_seconds_not_minutes():
     label = patches(box((1.0, 1.0, 1.0), (26, 26, 26)))
     assert np.bincount(label).max() <= 8
 
 
-@pytest.mark.parametrize("name", ["body", "ventricle"])
+@pytest.mark.parametrize("name", ["body", pytest.param("ventricle", marks=pytest.mark.slow)])
 def test_energy_by_hand(name, request):
     scene = request.getfixturevalue(name)
     u, theta = some_displacement(scene), scene.centre
@@ -117,7 +118,7 @@ def test_energy_by_hand(name, request):
     assert strain_energy(scene)(u, theta) != pytest.approx(float(strain_energy(plain)(u, theta)))
 
 
-@pytest.mark.parametrize("name", ["body", "ventricle"])
+@pytest.mark.parametrize("name", ["body", pytest.param("ventricle", marks=pytest.mark.slow)])
 def test_residual_and_tangent_are_derivatives_of_the_energy(name, request):
     scene = request.getfixturevalue(name)
     system, theta = System(scene), scene.centre

@@ -294,7 +294,14 @@ def test_frame_indifference(name):
 
 
 # A law of small strains is quadratic: no remainder to see a slope in.
-@pytest.mark.parametrize("name", sorted(name for name in LAWS if LAWS[name].objective))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name in ("ogden_2", "ogden_3") else ())
+        for name in sorted(LAWS)
+        if LAWS[name].objective
+    ],
+)
 def test_stress_and_tangent_are_the_derivatives_taylor(name):
     rng = np.random.default_rng(5)
     H, D = 0.1 * rng.normal(size=(3, 3)), rng.normal(size=(3, 3))

@@ -228,7 +228,8 @@ def test_without_fibres_angles_are_left_out(turning):
         assert ("inner" in without.parameter_names) == bool(without.angles), name
 
 
-@pytest.mark.parametrize("transverse", [pytest.param(0.0, marks=pytest.mark.slow), 0.3])
+@pytest.mark.parametrize("transverse", [0.0, 0.3])
+@pytest.mark.slow
 def test_muscle_pulls_along_fibres_that_turn(turning, fixed, transverse):
     """Energy of elements against springs, its slope by an angle, and the force on a loaded mesh."""
     loads = (*fixed.loads, ActiveTension(20.0, transverse=transverse))

@@ -53,6 +53,7 @@ def test_a_body_on_springs_alone_sinks_by_its_load_over_their_stiffness():
     np.testing.assert_allclose(u[:, 0], 2.0, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_springs_of_unknown_stiffness_are_those_of_that_stiffness():
     load = (Traction("right", (0.2, 0.0, 0.1)),)
     known = block(loads=load, supports=(ElasticSupport("left", 0.7),))

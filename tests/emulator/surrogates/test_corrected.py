@@ -77,21 +77,22 @@ class Fitted(Off):
         return inside_only(self, theta)
 
 
-@pytest.mark.parametrize("theta", [[-20.0, 70.0], [1e-300, 70.0], [jnp.nan, 70.0], [1e308, 70.0]])
-def test_outside_the_box_value_and_slopes_are_finite(beam, simulator, theta):
+def test_outside_the_box_value_and_slopes_are_finite(beam, simulator):
     polished = corrected(Fitted(simulator, 0.1), simulator)
-    at = jnp.asarray([theta, beam.centre])
+    outside = [[-20.0, 70.0], [1e-300, 70.0], [jnp.nan, 70.0], [1e308, 70.0]]
+    at = jnp.asarray([*outside, beam.centre])
     weights = jnp.asarray(np.random.default_rng(0).normal(size=beam.held.shape))
     f = lambda t: jnp.vdot(weights, polished.evaluate(t).displacement)
     found = jax.jit(jax.vmap(polished.evaluate))(at)
-    assert found.valid.tolist() == [False, True]
+    assert found.valid.tolist() == [False] * 4 + [True]
     assert np.isfinite(found.displacement).all()
     slopes = jax.jit(jax.vmap(jax.grad(f)))(at)
     assert np.isfinite(slopes).all()
-    np.testing.assert_allclose(slopes[1], jax.grad(f)(at[1]), rtol=1e-6)
-    assert np.isfinite(jax.grad(f)(at[0])).all()
-    _, along = jax.jvp(polished, (at[0],), (jnp.ones(2),))
-    assert np.isfinite(along).all()
+    np.testing.assert_allclose(slopes[-1], jax.grad(f)(at[-1]), rtol=1e-6)
+    for theta in at[:-1]:
+        assert np.isfinite(jax.grad(f)(theta)).all()
+        _, along = jax.jvp(polished, (theta,), (jnp.ones(2),))
+        assert np.isfinite(along).all()
 
 
 def test_a_start_that_inverts_elements_leaves_slopes_finite(beam, simulator):

@@ -171,6 +171,7 @@ def test_a_constant_is_the_series_of_order_zero():
     assert series.monomials(jnp.zeros((7, 2))).shape == (7, 0)
 
 
+@pytest.mark.slow
 def test_one_parameter():
     scene = block(loads=(Gravity(density=300.0),), cells=(1, 1, 1))
     scene = replace(scene, parameters=scene.parameters[:1], constants={"lam": 4.0})

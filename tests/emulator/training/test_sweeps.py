@@ -167,6 +167,7 @@ def test_killed_they_go_on_to_the_same_bits(beam, simulator, tmp_path, monkeypat
     assert resumed.number == 24
 
 
+@pytest.mark.slow
 def test_from_fems_series_about_the_centre_they_need_no_ramp(beam, simulator, tmp_path):
     plan = replace(recipe("sweeps"), order=2, sweeps=12)
     emulator, theta = train(beam, plan, tmp_path), sobol(beam, 1, 5)[0]
@@ -271,7 +272,7 @@ def test_what_cannot_be_swept_is_refused(beam, tmp_path):
     assert recipe("physics").runs == recipe("sweeps").runs == 0
 
 
-@pytest.mark.parametrize("factor", [-3.0, np.nan])
+@pytest.mark.parametrize("factor", [pytest.param(-3.0, marks=pytest.mark.slow), np.nan])
 def test_from_a_start_that_is_nowhere_near_they_go_on_from_rest(simulator, swept, factor):
     """A beam pushed through itself: no tangent there is positive definite."""
     through = factor * jnp.asarray(simulator.scene.mesh.nodes)

@@ -104,7 +104,7 @@ def sliding(law, transverse, **changes) -> Scene:
 
 
 @pytest.mark.parametrize("J", [pytest.param(0.97, marks=pytest.mark.slow), 0.9])
-@pytest.mark.parametrize("dilatation", ["pointwise", "mean"])
+@pytest.mark.parametrize("dilatation", ["pointwise", pytest.param("mean", marks=pytest.mark.slow)])
 def test_a_strip_shortens_as_it_does_by_hand(J, dilatation):
     r"""With :math:`W = \mu/2 (I_1 - 3) - \mu \ln J + \lambda/2 (\ln J)^2` nothing pulls at the ends,
 
