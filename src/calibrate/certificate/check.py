@@ -35,7 +35,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from calibrate.certificate.estimates import Tests, evidence_of
-from calibrate.certificate.mesh import MOST_RUNS, mesh_change
+from calibrate.certificate.mesh import mesh_change
 from calibrate.certificate.pool import Pool
 from calibrate.certificate.predictive import Predictive
 from calibrate.certificate.runs import Runs, Solver, correction_from, descend
@@ -55,6 +55,7 @@ from emulator.fem.campaign import executor
 
 _BEGIN, _AT_MOST = 70, 200  # FEM runs by default
 _FEWEST = 25
+_MOST_ON_FINER = 200
 # Shares of the runs that train the correction; the others test it.
 _AT_DRAWS, _AROUND, _AT_PRIOR, _DESCENTS, _ADAPTIVE = 0.15, 0.1, 0.1, 0.08, 0.12
 _FEWEST_DESCENTS = 16  # runs with which descents reach an end
@@ -103,8 +104,8 @@ def examine(
     ----------
     draws : the number of runs to begin with; alone, the number of runs.
     at_most : the number of runs up to which they are doubled while the verdict is undecided.
-    mesh : the number of solves on the next finer mesh (:mod:`calibrate.certificate.mesh`): 0 for
-        none, up to 15; by default four more than there are unknowns.
+    mesh : the largest number of solves on the next finer mesh (:mod:`calibrate.certificate.mesh`),
+        by default 30; 0 for none.
     scheduler : the address of a Dask scheduler whose workers solve; by default this process does.
     stages : the record of the seconds of each stage.
 
@@ -178,8 +179,8 @@ def _checked_counts(draws: int | None, at_most: int | None, mesh: int | None) ->
     count = min(_BEGIN, most) if draws is None else draws
     if count < _FEWEST:
         raise InputError(f"certify: {count} FEM runs asked for; give {_FEWEST} or more")
-    if mesh is not None and not 0 <= mesh <= MOST_RUNS:
-        raise InputError(f"certify: {mesh} solves on the finer mesh; give 0 to {MOST_RUNS}")
+    if mesh is not None and not 0 <= mesh <= _MOST_ON_FINER:
+        raise InputError(f"certify: {mesh} solves on the finer mesh; give 0 to {_MOST_ON_FINER}")
     if most < count:
         raise InputError(f"certify: at most {most} FEM runs, but {count} to begin with")
     return count, most

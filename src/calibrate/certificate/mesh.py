@@ -8,8 +8,8 @@ follows that posterior. The change is from the corrected posterior to this one, 
 of the pool. Its error is the jackknife's over the solves on the finer mesh, and over the pool.
 
 Solves on the finer mesh are dear. The first four points lie in the corrected posterior; where they
-leave no doubt, with twice the margin, there are no others. Otherwise more follow, in the posterior
-under the finer mesh's FEM as it is known by then.
+leave no doubt, with twice the margin, there are no others. Otherwise as many again follow, in the
+posterior under the finer mesh's FEM as it is known by then, until every figure is decided.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from calibrate.certificate.predictive import (
     no_correction,
 )
 from calibrate.certificate.runs import Runs
-from calibrate.certificate.verdict import MeshChange
+from calibrate.certificate.verdict import MeshChange, all_within
 from calibrate.measurements import Observations
 from calibrate.measurements.outputs import on_finer
 from emulator.accuracy.mesh_error import MeshError, MeshErrorEstimate, mesh_error
@@ -42,9 +42,11 @@ from emulator.core.errors import InputError, SolverError
 from emulator.fem import Simulator
 from emulator.fem.campaign import at_once, in_order
 
-MOST_RUNS = 15
+MOST_RUNS = 30
+"""Default of the largest number of solves on the finer mesh."""
 _FEWEST = 4  # least number of points at which both meshes are solved
 _MARGIN = 2.0  # factor between a figure and its limit at which few points decide
+_CANDIDATES = 20  # draws of which one is taken
 _ROUNDS = 12  # steps of the pool towards a posterior that may be many sd away
 
 Differences = Callable[[np.ndarray], Iterable[np.ndarray | None]]
@@ -54,15 +56,15 @@ None where FEM failed on one of the meshes.
 """
 
 
-def points_for(unknowns: int, states: int, most: int | None) -> int:
-    """Return the number of points at which both meshes are solved, in every load state.
+def points_for(unknowns: int, states: int, most: int | None) -> tuple[int, int]:
+    """Return the numbers of points, solved in every load state, that may decide and that end it.
 
-    The default is four more than there are unknowns, and at most 15 solves on a mesh.
+    A figure close to its limit is believed from four points more than there are unknowns.
 
-    most : the largest number of solves on a mesh.
+    most : the largest number of solves on a mesh; by default 30.
     """
-    wanted = unknowns + 4 if most is None else MOST_RUNS
-    return int(np.clip((most or MOST_RUNS) // states, _FEWEST, max(wanted, _FEWEST)))
+    largest = max((most or MOST_RUNS) // states, _FEWEST)
+    return min(unknowns + 4, largest), largest
 
 
 def mesh_change(
@@ -80,7 +82,7 @@ def mesh_change(
     ----------
     pool : the pool under the correction fitted to ``runs``.
     runs : all FEM runs of the check, on the mesh.
-    count : the number of solves on the finer mesh, see :func:`points_for`; 0 for none.
+    count : the largest number of solves on the finer mesh, see :func:`points_for`; 0 for none.
     """
     predictive = pool.predictive
     if count == 0:
@@ -94,8 +96,7 @@ def mesh_change(
         return MeshChange(why=str(reason))
     states = len(predictive.model.states.states)
     points = points_for(pool.z.shape[1], states, count)
-    solves = points * states
-    with counting(total=solves, desc="finer mesh", disable=not progress, unit="solve") as bar:
+    with counting(total=points[1] * states, desc="finer mesh", disable=not progress, unit="solve") as bar:
         differences = _differences_of_fem(predictive, error, observe, bar)
         model_error = predictive.model.error
         widened = model_error is not None and model_error.of_mesh
@@ -151,23 +152,24 @@ def change_by(
     differences: Differences,
     pool: Pool,
     runs: Runs,
-    most: int,
+    points: tuple[int, int],
     rng: np.random.Generator,
     *,
     widened: bool = False,
 ) -> MeshChange:
     """Return the changes of the corrected posterior by ``differences`` at a few points.
 
-    most : the largest number of points.
+    points : the numbers of points that may decide and that end it, see :func:`points_for`.
     widened : whether the likelihood allows for the error of the mesh.
     """
     correction_by = _corrections_by(pool.predictive, runs)
-    z, D = _at_draws(differences, pool, min(_FEWEST, most), rng)
-    asked, fine = min(_FEWEST, most), pool
+    enough, most = points
+    z, D = _at_draws(differences, pool, _FEWEST, rng, pool.z[:0])
+    asked, fine = _FEWEST, pool
     while True:
         change = MeshChange(runs=asked, failed=asked - len(z), widened=widened)
         if len(z) >= _FEWEST:
-            fine = fine.corrected_by(correction_by(z, D)).polished(rng, _ROUNDS, cheap=False)
+            fine = fine.corrected_by(correction_by(z, D)[0]).polished(rng, _ROUNDS, cheap=False)
             value, error = _change(fine, correction_by, z, D)
             names, p = pool.predictive.model.names, len(pool.predictive.model.names)
             figures = as_figures(value, error)
@@ -176,10 +178,12 @@ def change_by(
                 shift=dict(zip(names, figures[:p], strict=True)),
                 log_sd=dict(zip(names, figures[p:], strict=True)),
             )
-        if asked >= most or _leaves_no_doubt(change):
+        figures = change.comparisons()
+        decided = not figures or all_within(figures) is not None
+        if asked >= most or (decided and asked >= enough) or _leaves_no_doubt(change):
             return change
-        more = -(-(most - asked) // 2)
-        more_z, more_D = _at_draws(differences, fine, more, rng)
+        more = min(asked, most - asked)
+        more_z, more_D = _at_draws(differences, fine, more, rng, z)
         asked, z, D = asked + more, np.concatenate([z, more_z]), np.concatenate([D, more_D])
 
 
@@ -193,7 +197,7 @@ def _leaves_no_doubt(change: MeshChange) -> bool:
 
 def _change(
     fine: Pool,
-    correction_by: Callable[[np.ndarray, np.ndarray], Correction],
+    correction_by: Callable[..., tuple[Correction, ...]],
     z: np.ndarray,
     D: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -203,7 +207,7 @@ def _change(
     z, D : the points (k, p) at which both meshes were solved, and the differences (k, m).
     """
     # The corrected posterior on the mesh, over the same points.
-    before = fine.corrected_by(correction_by(z[:0], D[:0])).corrected
+    before = fine.corrected_by(correction_by(z[:0], D[:0])[0]).corrected
     x = fine.predictive.columns(fine.z)
     p = x.shape[1]
 
@@ -212,46 +216,64 @@ def _change(
         return np.concatenate([(new - old)[:p] / np.exp(old[p : 2 * p]), (new - old)[p : 2 * p]])
 
     value, error = jackknife(lambda used: change(fine.corrected, used), len(x))
+    like = correction_by(z, D)[1]
     leave_one_out = [
-        change(fine.corrected_by(correction_by(z[remaining], D[remaining])).corrected)
+        change(fine.corrected_by(correction_by(z[remaining], D[remaining], like)[0]).corrected)
         for remaining in ~np.eye(len(z), dtype=bool)
     ]
     variance = np.sum((np.array(leave_one_out) - value) ** 2, axis=0) * (len(z) - 1) / len(z)
     return value, np.hypot(error, np.sqrt(variance))
 
 
-def _corrections_by(
-    predictive: Predictive, runs: Runs
-) -> Callable[[np.ndarray, np.ndarray], Correction]:
-    """Return the function from points z (k, p) and differences (k, m) to the map's correction.
+def _corrections_by(predictive: Predictive, runs: Runs) -> Callable[..., tuple[Correction, ...]]:
+    """Return the function from points z (k, p) and differences (k, m) to two corrections.
 
-    The correction is to FEM on the finer mesh; without points, to FEM on the mesh.
+    The first one is the map's to FEM on the finer mesh, or without points to FEM on the mesh; the
+    second one is the differences' own, whose kernel a third argument may set. All of the first
+    kind have one kernel: a choice that flips between them would count as a change of the mesh.
     """
     means, valid = predictive.means(runs.z)
     x, usable = predictive.features(runs.z), valid & runs.converged
     errors_on_mesh = runs.means - means
 
-    def correction_by(z: np.ndarray, D: np.ndarray) -> Correction:
-        errors = errors_on_mesh
-        if len(z):
-            mesh = fit_correction(predictive.features(z), D, predictive.scales, len(z))
-            errors = errors + np.asarray(corrections(mesh, x))
+    def fitted(errors: np.ndarray, like: Correction | None = None) -> Correction:
         if usable.sum() < x.shape[1] + 2:
             return no_correction(len(runs.z), x.shape[1], errors.shape[1])
-        return fit_correction(x[usable], errors[usable], predictive.scales, len(runs.z))
+        scales, rows = predictive.scales, len(runs.z)
+        return fit_correction(x[usable], errors[usable], scales, rows, like=like)
+
+    on_mesh = fitted(errors_on_mesh)
+
+    def correction_by(
+        z: np.ndarray, D: np.ndarray, like: Correction | None = None
+    ) -> tuple[Correction, Correction]:
+        if not len(z):
+            return on_mesh, on_mesh
+        of_mesh = fit_correction(predictive.features(z), D, predictive.scales, len(z), like=like)
+        errors = errors_on_mesh + np.asarray(corrections(of_mesh, x))
+        return fitted(errors, like=on_mesh), of_mesh
 
     return correction_by
 
 
 def _at_draws(
-    differences: Differences, pool: Pool, count: int, rng: np.random.Generator
+    differences: Differences, pool: Pool, count: int, rng: np.random.Generator, known: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return draws (k, p) of the corrected posterior, and FEM's differences (k, m) there.
+    """Return draws z (k, p) of the corrected posterior, and FEM's differences (k, m) there.
 
-    Of ``count`` draws those at which FEM converged on both meshes.
+    Of many draws those are taken that are farthest from the points before, and from ``known`` ones
+    (n, p): the differences are smooth, so that a point close to another says nothing new. Of
+    ``count`` draws those are returned at which FEM converged on both meshes.
     """
-    z = pool.z[rng.choice(len(pool.z), size=count, p=pool.corrected)]
-    every = list(differences(z))
+    z = pool.z[rng.choice(len(pool.z), size=_CANDIDATES * count, p=pool.corrected)]
+    x = pool.predictive.features(np.concatenate([known, z]))
+    taken, x = x[: len(known)], x[len(known) :]
+    distance = np.min(((x[:, None] - taken) ** 2).sum(axis=-1), axis=1, initial=np.inf)
+    rows: list[int] = []
+    for _ in range(count):
+        rows.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, ((x - x[rows[-1]]) ** 2).sum(axis=-1))
+    every = list(differences(z[rows]))
     converged = np.array([difference is not None for difference in every], dtype=bool)
     D = np.array([difference for difference in every if difference is not None])
-    return z[converged], D.reshape(-1, len(pool.predictive.scales))
+    return z[rows][converged], D.reshape(-1, len(pool.predictive.scales))

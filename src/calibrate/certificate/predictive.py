@@ -105,6 +105,7 @@ def fit_correction(
     scales: np.ndarray,
     rows: int,
     likely: np.ndarray | None = None,
+    like: Correction | None = None,
 ) -> Correction:
     """Fit the Gaussian process, or return no correction where that has smaller errors.
 
@@ -117,7 +118,10 @@ def fit_correction(
         compiled once.
     likely : (n,) bool, points at which the process has to be better than no correction; all by
         default.
+    like : the correction whose kernel is taken as it is; by default it is searched for.
     """
+    chosen = like is not None and like.nugget > 0.0
+    kernels = [(like.length, like.nugget)] if chosen else list(product(_LENGTHS, _NUGGETS))
     none, fitted = (no_correction(rows, x.shape[1], errors.shape[1]) for _ in range(2))
     fitted.at[: len(x)] = x
     linear = _TREND * (1.0 + x @ x.T)
@@ -125,7 +129,7 @@ def fit_correction(
     test_rows = slice(None) if likely is None or not likely.any() else likely
     smallest_loss, loss_where_likely = np.inf, np.inf
     distances = ((x[:, None] - x) ** 2).sum(axis=-1)
-    for length, nugget in product(_LENGTHS, _NUGGETS):
+    for length, nugget in kernels:
         kernel = linear + squared_exponential(distances / length**2) + nugget * np.eye(len(x))
         inverse = cho_solve(cho_factor(kernel), np.eye(len(x)))
         weights = inverse @ errors

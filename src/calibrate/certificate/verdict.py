@@ -81,7 +81,7 @@ Comparison = tuple[str, Figure, float]
 """A figure in words, the figure, and its limit."""
 
 
-def _all_within(comparisons: list[Comparison]) -> bool | None:
+def all_within(comparisons: list[Comparison]) -> bool | None:
     """Return whether all figures are within their limits; ``None`` if that is undecided."""
     answers = [figure.within(limit) for _, figure, limit in comparisons]
     if False in answers:
@@ -337,7 +337,7 @@ def _mesh(mesh: MeshChange) -> tuple[bool | None, list[Finding]]:
     if not mesh.shift:
         failed = f"FEM failed at {mesh.failed} of {mesh.runs} points {finer}"
         return None, [(failed, "refine the mesh")]
-    within = _all_within(comparisons := mesh.comparisons())
+    within = all_within(comparisons := mesh.comparisons())
     if within:
         worst = max(abs(figure.value) for figure in mesh.shift.values())
         words = f"mesh: {finer} no mean would move by more than {worst:.2f} posterior sd"
@@ -345,7 +345,7 @@ def _mesh(mesh: MeshChange) -> tuple[bool | None, list[Finding]]:
     decisive = [w for w, figure, limit in comparisons if figure.within(limit) is within]
     if within is None:
         close = f"{finer} the {decisive[0]}, too close to the limit for its error"
-        return None, [(close, "give more runs on the finer mesh (--mesh-runs)")]
+        return None, [(close, f"give more runs there (--mesh-runs {2 * mesh.runs})")]
     remedy = _QUADRATIC if mesh.linear else _REFINE
     if mesh.widened:
         remedy = "learn the error of the mesh from more runs, or emulate the finer mesh"
@@ -357,7 +357,7 @@ def _agreement(evidence: Evidence) -> tuple[Verdict, list[Finding]]:
     tail, draws = evidence.tail, evidence.draws
     if (verdict_of_weights := _weights(tail)) is not None:
         return verdict_of_weights
-    agree = _all_within(comparisons := draws.comparisons())
+    agree = all_within(comparisons := draws.comparisons())
     if agree:
         worst = max((abs(f.value) for f in draws.shift.values()), default=0.0)
         return "accepted", [(f"no mean moves by more than {worst:.2f} posterior sd", "")]
@@ -368,7 +368,7 @@ def _agreement(evidence: Evidence) -> tuple[Verdict, list[Finding]]:
         some = f", some {100 * int(np.ceil(runs / 100.0))}" if factor < _MANY else ""
         close = f"{decisive[0][0]}, too close to the limit for its error"
         return "undecided", [(close, _MORE + some)]
-    repaired = _all_within(evidence.corrected.comparisons())
+    repaired = all_within(evidence.corrected.comparisons())
     if repaired:
         return "reweight", [(words, "use the reweighted posterior") for words, _, _ in decisive]
     verdict: Verdict = "undecided" if repaired is None else "not certified"

@@ -74,14 +74,6 @@ def density_of(model: Model) -> Density:
     """Return the density of a model's posterior, up to a constant."""
     names = tuple(sorted(model.sampled_priors))
     transforms = {name: biject_to(model.sampled_priors[name].support) for name in names}
-    example = {name: np.zeros(shape) for name, shape in model.observe.shapes.items()}
-    hidden: list[str] = []  # by name: the Jacobian of a coordinate is a site too, and observed
-
-    def hide() -> None:
-        sites = handlers.trace(handlers.seed(model, jax.random.key(0))).get_trace(example)
-        hidden.extend(name for name, site in sites.items() if site.get("is_observed", False))
-
-    jax.eval_shape(hide)  # which computes nothing
 
     def coordinates(z: jax.Array) -> dict[str, jax.Array]:
         return dict(zip(names, z, strict=True))
@@ -90,8 +82,7 @@ def density_of(model: Model) -> Density:
         return -potential_energy(model, (data,), {}, coordinates(z))
 
     def log_prior(z: jax.Array) -> jax.Array:
-        unobserved = handlers.block(model, hide=hidden)
-        return -potential_energy(unobserved, (example,), {}, coordinates(z))
+        return -potential_energy(model.draw_unknowns, (), {}, coordinates(z))
 
     def log_likelihood(z: jax.Array, data: Data) -> jax.Array:
         return model.map_log_likelihood(draw(z), data)
@@ -100,8 +91,7 @@ def density_of(model: Model) -> Density:
         return {name: transforms[name](value) for name, value in coordinates(z).items()}
 
     def prior_draw(rng_key: jax.Array) -> jax.Array:
-        trace = handlers.trace(handlers.seed(model, rng_key)).get_trace()
-        return unconstrain({name: trace[name]["value"] for name in names})
+        return unconstrain(handlers.seed(model.draw_unknowns, rng_key)())
 
     def unconstrain(draw: Mapping[str, jax.Array]) -> jax.Array:
         return jnp.stack([transforms[name].inv(draw[name]) for name in names])
@@ -153,12 +143,13 @@ def _height_program(density: Density) -> Callable[..., Heights]:
 
 @lru_cache(maxsize=4)
 def _prior_program(density: Density) -> Callable[..., jax.Array]:
-    return jax.jit(jax.vmap(density.prior_draw))
+    return jax.jit(jax.vmap(lambda key: density.prior_draw(jax.random.wrap_key_data(key))))
 
 
 def prior_draws(density: Density, rng_key: jax.Array, count: int) -> np.ndarray:
     """Return points z (count, p) drawn from the prior."""
-    return finite_coordinates(_prior_program(density)(jax.random.split(rng_key, count)))
+    keys = jax.random.key_data(jax.random.split(rng_key, count))
+    return finite_coordinates(in_blocks(_prior_program(density), np.asarray(keys)))
 
 
 def in_blocks(program: Callable[..., Any], *points: np.ndarray) -> Any:

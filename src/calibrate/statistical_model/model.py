@@ -171,6 +171,13 @@ class Model:
             log_density += prior.log_prob(values[name])
         return log_density
 
+    def draw_unknowns(self) -> dict[str, jax.Array]:
+        """Sample all that is inferred from its prior, as a NumPyro program; return it by name."""
+        draw: dict[str, jax.Array] = {}
+        for name, prior in self.sampled_priors.items():
+            draw[name] = numpyro.sample(name, self.given_earlier(name, prior, draw))
+        return draw
+
     # The likelihood.
 
     def __call__(
@@ -181,9 +188,7 @@ class Model:
         data : the data by name, or as they are when one thing is observed.
         prediction : the result of :meth:`evaluate` at the drawn theta, where it is known already.
         """
-        draw: dict[str, jax.Array] = {}
-        for name, prior in self.sampled_priors.items():
-            draw[name] = numpyro.sample(name, self.given_earlier(name, prior, draw))
+        draw = self.draw_unknowns()
         thetas = self.states.thetas(draw)
         prediction = self.evaluate(thetas) if prediction is None else prediction
         # Where the forward map has no answer, the density is zero, not NaN.

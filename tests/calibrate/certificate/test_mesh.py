@@ -9,7 +9,7 @@ import pytest
 import calibrate as cal
 import emulator as em
 from calibrate.certificate import examine
-from calibrate.certificate.mesh import change_by, points_for
+from calibrate.certificate.mesh import _at_draws, change_by, points_for
 from calibrate.certificate.verdict import Figure, MeshChange, judge
 from calibrate.statistical_model import with_error
 from certificate_support import exact_data, exact_posterior, grid_of, linear_model, quadrature
@@ -48,7 +48,7 @@ def test_shifts_are_those_of_the_quadrature(fem, check, stretch, shift):
     model = found.posterior.model
     fine, differences = finer_than(fem, model, stretch, shift)
     by_fem = lambda z: differences(z, found.pool.predictive)
-    told = change_by(by_fem, found.pool, found.tests.runs, 8, np.random.default_rng(0))
+    told = change_by(by_fem, found.pool, found.tests.runs, (8, 8), np.random.default_rng(0))
     points, weights, moved = grid_of(), quadrature(fem, data), quadrature(fine, data)
     mean, after = weights @ points, moved @ points
     sd, sd_after = (np.sqrt(w @ (points - m) ** 2) for w, m in ((weights, mean), (moved, after)))
@@ -61,10 +61,47 @@ def test_shifts_are_those_of_the_quadrature(fem, check, stretch, shift):
         )
 
 
+def test_points_are_doubled_until_every_figure_is_decided(fem, check):
+    """A mesh that moves a mean by just the limit is never decided; one that moves none, at once."""
+    _, found = check
+    model, rng, counts = found.posterior.model, np.random.default_rng(1), []
+
+    def moved(shift):
+        _, differences = finer_than(fem, model, 0.0, shift)
+
+        def counted(z):
+            counts.append(len(z))
+            return differences(z, found.pool.predictive)
+
+        counts.clear()
+        return change_by(counted, found.pool, found.tests.runs, (6, 40), rng)
+
+    slope = max(abs(figure.value) for figure in moved(0.01).shift.values()) / 0.01
+    assert counts == [4]
+    assert moved(0.5 / slope).runs == sum(counts) == 40
+    assert counts == [4, 4, 8, 16, 8]
+
+
+def test_points_are_far_from_each_other(fem, check):
+    """The least distance between two of them, beside draws at random."""
+    _, found = check
+    pool, rng = found.pool, np.random.default_rng(0)
+    every = lambda z: list(np.zeros((len(z), len(pool.predictive.scales))))
+    z, _ = _at_draws(every, pool, 8, rng, pool.z[:0])
+    more, _ = _at_draws(every, pool, 8, rng, z)
+    x = pool.predictive.features(np.concatenate([z, more]))
+    random = pool.predictive.features(pool.z[rng.choice(len(pool.z), 16, p=pool.corrected)])
+    gaps = [
+        np.sort(np.linalg.norm(p[:, None] - p, axis=-1), axis=1)[:, 1].min() for p in (x, random)
+    ]
+    assert gaps[0] > 3.0 * gaps[1]
+
+
 def test_failures_on_the_finer_mesh_leave_it_open(check):
     _, found = check
     failures = lambda z: [None] * len(z)
-    told = change_by(failures, found.pool, found.tests.runs, 8, np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    told = change_by(failures, found.pool, found.tests.runs, (8, 30), rng)
     assert told.failed == 8
     assert not told.shift
     certificate = judge(replace(found.certificate.evidence, mesh=told))
@@ -102,11 +139,11 @@ def test_the_verdict_follows_the_mesh(check):
 
 
 def test_solves_are_counted_in_every_load_state():
-    assert points_for(2, 1, None) == 6
-    assert points_for(18, 1, None) == 15
-    assert points_for(4, 3, None) == 5
-    assert points_for(2, 1, 12) == 12
-    assert points_for(2, 10, None) == 4  # fewer say nothing of the error
+    assert points_for(2, 1, None) == (6, 30)
+    assert points_for(18, 1, None) == (22, 30)
+    assert points_for(4, 3, None) == (8, 10)
+    assert points_for(2, 1, 5) == (5, 5)
+    assert points_for(2, 10, None) == (4, 4)  # fewer say nothing of the error
 
 
 @pytest.mark.slow

@@ -80,7 +80,7 @@ def _add_solves(parser: ArgumentParser) -> None:
         "--mesh-runs",
         type=int,
         metavar="N",
-        help="solves on the next finer mesh (default: four more than unknowns, at most 15)",
+        help="at most so many solves on the next finer mesh (default: until they decide, 30)",
     )
     finer.add_argument("--no-mesh", action="store_true", help="leave the error of the mesh out")
 
