@@ -96,7 +96,9 @@ def mesh_change(
         return MeshChange(why=str(reason))
     states = len(predictive.model.states.states)
     points = points_for(pool.z.shape[1], states, count)
-    with counting(total=points[1] * states, desc="finer mesh", disable=not progress, unit="solve") as bar:
+    with counting(
+        total=points[1] * states, desc="finer mesh", disable=not progress, unit="solve"
+    ) as bar:
         differences = _differences_of_fem(predictive, error, observe, bar)
         model_error = predictive.model.error
         widened = model_error is not None and model_error.of_mesh
