@@ -180,8 +180,8 @@ def change_by(
                 shift=dict(zip(names, figures[:p], strict=True)),
                 log_sd=dict(zip(names, figures[p:], strict=True)),
             )
-        figures = change.comparisons()
-        decided = not figures or all_within(figures) is not None
+        comparisons = change.comparisons()
+        decided = not comparisons or all_within(comparisons) is not None
         if asked >= most or (decided and asked >= enough) or _leaves_no_doubt(change):
             return change
         more = min(asked, most - asked)

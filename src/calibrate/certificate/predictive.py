@@ -120,8 +120,9 @@ def fit_correction(
         default.
     like : the correction whose kernel is taken as it is; by default it is searched for.
     """
-    chosen = like is not None and like.nugget > 0.0
-    kernels = [(like.length, like.nugget)] if chosen else list(product(_LENGTHS, _NUGGETS))
+    kernels = list(product(_LENGTHS, _NUGGETS))
+    if like is not None and like.nugget > 0.0:
+        kernels = [(like.length, like.nugget)]
     none, fitted = (no_correction(rows, x.shape[1], errors.shape[1]) for _ in range(2))
     fitted.at[: len(x)] = x
     linear = _TREND * (1.0 + x @ x.T)
