@@ -11,8 +11,8 @@ LENIENT := --no-warn-unused-ignores $(addprefix --disable-error-code ,import-unt
 # With the oldest libraries: what each of them is used for.
 OLDEST := .venv-oldest
 OLDEST_TESTS := tests/test_package.py $(addprefix tests/emulator/,mechanics scenes fem/test_simulator.py surrogates \
-	training test_schema.py test_store.py) $(addprefix tests/calibrate/,samplers certificate cli/test_cli.py \
-	analysis/sensitivity report posterior/test_tree.py measurements/test_data.py project/test_demo.py)
+	training core/test_schema.py core/test_store.py) $(addprefix tests/calibrate/,samplers certificate cli/test_cli.py \
+	analysis/test_sensitivity.py report posterior/test_tree.py measurements/test_data.py project/test_demo.py)
 
 .PHONY: demo test test-slow test-studies test-oldest package notebooks pictures docs lint format study clean
 

@@ -1,6 +1,7 @@
 """The package as a whole: what importing it does, and what never gets in."""
 
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -86,6 +87,17 @@ def test_the_oldest_versions_are_those_that_pyproject_allows():
     every = [*project["dependencies"], *project["optional-dependencies"]["plot"]]
     lines = (ROOT / "constraints-oldest.txt").read_text().splitlines()
     assert {word.split(",")[0].replace(">=", "==") for word in every} <= set(lines)
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="there is no make")
+@pytest.mark.parametrize("target", ["test", "test-slow", "test-studies", "test-oldest", "notebooks"])
+def test_every_target_tests_what_is_there(target):
+    """A target that few people run named files that had moved."""
+    commands = subprocess.run(
+        ["make", "--dry-run", target], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
+    for path in re.findall(r"[ =](tests/\S+)", commands):
+        assert (ROOT / path).exists(), path
 
 
 def test_versions_agree():
