@@ -118,12 +118,12 @@ def public_names(code):
             yield from (alias.name for alias in node.names)
 
 
-# Pages with more than ten seconds of examples: compilation, nearly all.
-LONG = ("docs/analyses.md", "docs/observations.md", "docs/populations.md", "docs/quickstart.md")
+# Pages whose examples take five seconds or more: compilation, nearly all.
+LONG = ("accuracy", "analyses", "observations", "own_mesh", "populations", "quickstart", "unloading")
 
 
 @pytest.mark.parametrize(
-    "page", [pytest.param(p, marks=pytest.mark.slow if p in LONG else ()) for p in PAGES]
+    "page", [pytest.param(p, marks=pytest.mark.slow if Path(p).stem in LONG else ()) for p in PAGES]
 )
 def test_the_quick_examples_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -90,7 +90,9 @@ def test_the_oldest_versions_are_those_that_pyproject_allows():
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="there is no make")
-@pytest.mark.parametrize("target", ["test", "test-slow", "test-studies", "test-oldest", "notebooks"])
+@pytest.mark.parametrize(
+    "target", ["test", "test-slow", "test-studies", "test-oldest", "notebooks"]
+)
 def test_every_target_tests_what_is_there(target):
     """A target that few people run named files that had moved."""
     commands = subprocess.run(

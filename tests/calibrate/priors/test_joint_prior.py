@@ -118,6 +118,7 @@ def test_nuts_meets_the_closed_form_posterior(beam):
     assert set(names) == set(order)
 
 
+@pytest.mark.slow
 def test_density_and_draws_of_the_prior_agree(beam):
     """E_prior of score is zero: the density the samplers see is the one the draws come from."""
     prior = cal.truncated(JointPrior(log_normals(0.2), Dependence(("mu", "lam"), HALF)), beam)

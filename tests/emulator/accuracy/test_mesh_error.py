@@ -57,6 +57,7 @@ def test_effectivity(coarse, error):
     assert 0.6 < float(jnp.linalg.norm(told.field[at]) / jnp.linalg.norm(true)) < 1.1
 
 
+@pytest.mark.slow
 def test_locked_elements_are_far_off_and_said_so():
     scene = em.scenes.once_clamped_beam(cells=(4, 1, 1), order=1)
     told = em.mesh_error(scene)(scene.centre)

@@ -138,6 +138,7 @@ def test_residual_and_tangent_are_derivatives_of_the_energy(name, request):
     np.testing.assert_allclose(pattern.product(K, system.restrict(v)), along, atol=1e-9 * size)
 
 
+@pytest.mark.slow
 def test_a_homogeneous_deformation_is_reproduced():
     scene = patched(block())
     H = 0.1 * np.random.default_rng(0).normal(size=(3, 3))
