@@ -119,7 +119,15 @@ def public_names(code):
 
 
 # Pages whose examples take five seconds or more: compilation, nearly all.
-LONG = ("accuracy", "analyses", "observations", "own_mesh", "populations", "quickstart", "unloading")
+LONG = (
+    "accuracy",
+    "analyses",
+    "observations",
+    "own_mesh",
+    "populations",
+    "quickstart",
+    "unloading",
+)
 
 
 @pytest.mark.parametrize(
