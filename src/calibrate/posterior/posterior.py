@@ -14,6 +14,7 @@ import jax
 import numpy as np
 import numpyro.distributions as dist
 import xarray as xr
+from threadpoolctl import threadpool_limits
 
 from calibrate.arviz import base
 from calibrate.measurements import Observation, Observations, missing_values
@@ -201,6 +202,9 @@ def _plain(value: Any) -> str:
     return repr(np.asarray(value).tolist())
 
 
+# Samplers call BLAS with small matrices, and from several threads: with a thread a core in each call
+# they wait for each other, in L-BFGS-B fifty times as long as they compute.
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def sample(
     model: Model,
     data: np.ndarray | Mapping[str, np.ndarray],
