@@ -202,8 +202,8 @@ def _plain(value: Any) -> str:
     return repr(np.asarray(value).tolist())
 
 
-# Samplers call BLAS with small matrices, and from several threads: with a thread a core in each call
-# they wait for each other, in L-BFGS-B fifty times as long as they compute.
+# Samplers call BLAS with small matrices, and from several threads. With a thread a core in each
+# call, these wait for each other: in L-BFGS-B fifty times as long as they compute.
 @threadpool_limits.wrap(limits=1, user_api="blas")
 def sample(
     model: Model,
