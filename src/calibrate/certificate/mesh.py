@@ -46,7 +46,7 @@ MOST_RUNS = 30
 """Default of the largest number of solves on the finer mesh."""
 _FEWEST = 4  # least number of points at which both meshes are solved
 _MARGIN = 2.0  # factor between a figure and its limit at which few points decide
-_CANDIDATES = 20  # draws of which one is taken
+_CANDIDATES = 4  # draws of which one is taken
 _ROUNDS = 12  # steps of the pool towards a posterior that may be many sd away
 
 Differences = Callable[[np.ndarray], Iterable[np.ndarray | None]]
@@ -118,34 +118,36 @@ def _differences_of_fem(
 ) -> Differences:
     """Return FEM's differences; solves on the finer mesh run in parallel.
 
-    Each starts from the first finer solution of its load state.
+    Each starts from the finer solutions of its own point's earlier states, of the first point, and
+    of earlier calls: never from what another thread may have finished or not.
     """
-    model, first = predictive.model, dict[int, MeshErrorEstimate]()
+    model = predictive.model
+    known: list[MeshErrorEstimate] = []
     workers = at_once(error.simulator, len(error.finer.scene.mesh.nodes))
 
     def flat(observe: Observations, thetas: jax.Array, fields: list[jax.Array]) -> np.ndarray:
         stacked = jnp.stack([u[observe.nodes] for u in fields])
         return np.asarray(ravel_pytree(observe(stacked, thetas))[0])
 
-    def difference(thetas: jax.Array) -> np.ndarray | None:
+    def difference(thetas: jax.Array) -> tuple[np.ndarray | None, list[MeshErrorEstimate]]:
+        own: list[MeshErrorEstimate] = []
         try:
-            estimates = [
-                error(theta, model.full(theta), neighbour=first.get(s))
-                for s, theta in enumerate(thetas)
-            ]
+            for theta in thetas:
+                own.append(error(theta, model.full(theta), known=[*known, *own]))
         except SolverError:
-            return None
-        for s, estimate in enumerate(estimates):
-            first.setdefault(s, estimate)
-        fine = flat(observe, thetas, [each.fine for each in estimates])
-        return fine - flat(model.observe, thetas, [each.coarse for each in estimates])
+            return None, []
+        fine = flat(observe, thetas, [each.fine for each in own])
+        return fine - flat(model.observe, thetas, [each.coarse for each in own]), own
 
     def differences(z: np.ndarray) -> Iterator[np.ndarray | None]:
-        draws = predictive.constrain(z)
+        draws, later = predictive.constrain(z), list[MeshErrorEstimate]()
         each = ({name: values[k] for name, values in draws.items()} for k in range(len(z)))
-        for result in in_order(difference, map(model.states.thetas, each), workers):
+        results = in_order(difference, map(model.states.thetas, each), workers)
+        for number, (result, found) in enumerate(results):
+            (later if number else known).extend(found)  # the first point is solved alone
             bar.update(len(model.states.states))
             yield result
+        known.extend(later)
 
     return differences
 
@@ -271,9 +273,11 @@ def _at_draws(
     x = pool.predictive.features(np.concatenate([known, z]))
     taken, x = x[: len(known)], x[len(known) :]
     distance = np.min(((x[:, None] - taken) ** 2).sum(axis=-1), axis=1, initial=np.inf)
+    centre = int(np.argmin(((x - x.mean(axis=0)) ** 2).sum(axis=-1)))
     rows: list[int] = []
     for _ in range(count):
-        rows.append(int(np.argmax(distance)))
+        first = not len(known) and not rows  # solves far away begin at the first one's
+        rows.append(centre if first else int(np.argmax(distance)))
         distance = np.minimum(distance, ((x - x[rows[-1]]) ** 2).sum(axis=-1))
     every = list(differences(z[rows]))
     converged = np.array([difference is not None for difference in every], dtype=bool)

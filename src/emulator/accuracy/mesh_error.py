@@ -10,15 +10,19 @@ solutions, a half at :math:`k = 1`, as at the edge of a clamp; from linear to qu
 nearly all of it. So the difference has an effectivity of one half to one.
 
 No solve from rest is needed. The iteration on the finer mesh starts from the prolonged solution,
-plus the difference found at another theta. A Newton step is checked by a second back-substitution
-(:func:`emulator.accuracy.estimate.newton_distance`), and another step follows if the second is not
-much shorter. Where steps do not contract, as for locked elements far from any known theta, FEM
-solves on the finer mesh.
+plus a combination of the differences :math:`D_i` found at other :math:`\theta_i`, with the weights
+
+.. math:: \min_w \; \Big|\sum_i w_i x_i - x\Big|^2 + 10^{-2}\, |w|^2, \qquad \sum_i w_i = 1
+
+of positions x in the unit box: linear interpolation where they surround theta. A Newton step is
+checked by a second back-substitution (:func:`emulator.accuracy.estimate.newton_distance`), and
+another step follows if what the second leaves is much. Where steps do not contract, as for locked
+elements far from any known theta, FEM solves on the finer mesh.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from threading import Lock
@@ -26,6 +30,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from emulator.accuracy.estimate import Distance, newton_distance
 from emulator.core.errors import InputError
@@ -39,8 +44,9 @@ LARGEST = 60_000
 """Nodes of the largest finer mesh that is solved on; beyond, a factorisation takes a minute."""
 
 _TOLERANCE = 1e-7  # solves on the finer mesh: far below the meshes' difference
-_CONTRACTION = 0.1  # largest contraction of the last step; above it, another step follows
+_LEFT = 0.02  # largest share of the meshes' difference that the last step may leave
 _DIVERGENCE = 0.5  # contraction of a step above which FEM solves instead
+_RIDGE = 1e-2  # of the weights of known differences
 _STEPS = 3  # largest number of steps
 
 Quantity = Callable[[jax.Array, jax.Array], jax.Array]
@@ -94,15 +100,14 @@ class MeshError:
         theta: jax.Array,
         start: jax.Array | None = None,
         *,
-        neighbour: MeshErrorEstimate | None = None,
+        known: Sequence[MeshErrorEstimate] = (),
     ) -> MeshErrorEstimate:
         """Estimate the error at ``theta`` (p,).
 
         Parameters
         ----------
         start : the start of the solve on the mesh, (n, 3) mm; the state at rest by default.
-        neighbour : the estimate at a nearby theta, whose difference between the meshes begins the
-            iteration.
+        known : estimates at other theta, whose differences between the meshes begin the iteration.
 
         Raises
         ------
@@ -113,11 +118,13 @@ class MeshError:
         what = "the error of the mesh"
         coarse = self.simulator.solve(theta, start).require_converged(what).displacement
         prolong = self.finer.refinement.carry
-        begin = jnp.asarray(prolong(coarse))
-        if neighbour is not None:
-            begin = begin + neighbour.fine - jnp.asarray(prolong(neighbour.coarse))
+        begin = prolonged = jnp.asarray(prolong(coarse))
+        for weight, other in zip(self._weights(theta, known), known, strict=True):
+            begin = begin + weight * (other.fine - jnp.asarray(prolong(other.coarse)))
         # A step solves one set of equations; a scene whose mesh is the loaded shape has two.
-        fine_by_steps = None if self.fine.scene.loaded_by else self._fine_by_steps(theta, begin)
+        fine_by_steps = (
+            None if self.fine.scene.loaded_by else self._fine_by_steps(theta, begin, prolonged)
+        )
         if fine_by_steps is not None:
             return MeshErrorEstimate(theta, coarse, fine_by_steps, solved=False)
         with self._alone:
@@ -127,6 +134,18 @@ class MeshError:
         fine = solution.require_converged(f"{what}, on the finer one").displacement
         return MeshErrorEstimate(theta, coarse, fine, solved=True)
 
+    def _weights(self, theta: jax.Array, known: Sequence[MeshErrorEstimate]) -> np.ndarray:
+        """Return the weights of the differences of ``known`` estimates at ``theta`` (p,)."""
+        scene, count = self.simulator.scene, len(known)
+        if not count:
+            return np.zeros(0)
+        x = np.stack([np.asarray(scene.to_unit(other.theta)) for other in known])
+        matrix = np.ones((count + 1, count + 1))
+        matrix[:count, :count] = x @ x.T + _RIDGE * np.eye(count)
+        matrix[count, count] = 0.0
+        right = np.append(x @ np.asarray(scene.to_unit(theta)), 1.0)
+        return np.linalg.solve(matrix, right)[:count]
+
     def forget(self) -> None:
         """Free all factors that are kept: a large mesh's are gigabytes, and would stay."""
         free_factors()
@@ -135,14 +154,21 @@ class MeshError:
     def _step(self) -> Callable[[jax.Array, jax.Array], Distance]:
         return compiled(partial(newton_distance, self.fine.system))
 
-    def _fine_by_steps(self, theta: jax.Array, u: jax.Array) -> jax.Array | None:
-        """Take a few steps from ``u`` (f, 3) on the finer mesh; None if they do not contract."""
+    def _fine_by_steps(
+        self, theta: jax.Array, u: jax.Array, prolonged: jax.Array
+    ) -> jax.Array | None:
+        """Take a few steps from ``u`` (f, 3) on the finer mesh; None if they do not contract.
+
+        They end where what they leave, the contraction times the last step, is a small share of the
+        difference from the coarse solution ``prolonged`` (f, 3).
+        """
         for _ in range(_STEPS):
             step = self._step(u, theta)
             if not float(step.contraction) <= _DIVERGENCE:
                 return None
             u = u - step.error
-            if step.accepted and float(step.contraction) <= _CONTRACTION:
+            left = step.contraction * jnp.abs(step.error).max()
+            if step.accepted and float(left) <= _LEFT * float(jnp.abs(u - prolonged).max()):
                 return u
         return None
 

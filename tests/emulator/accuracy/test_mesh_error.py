@@ -35,7 +35,7 @@ def test_a_finer_scene_has_the_same_problem(coarse):
 def test_a_few_steps_find_what_a_solve_on_the_finer_mesh_finds(coarse, error):
     first = error(coarse.centre)
     theta = coarse.from_unit(jnp.array([0.45, 0.55]))
-    near = error(theta, neighbour=first)
+    near = error(theta, known=[first])
     assert not near.solved
     for told in (first, near):
         exact = error.fine.solve(told.theta).require_converged().displacement
