@@ -41,7 +41,7 @@ from calibrate.noise import information_about_means
 from calibrate.statistical_model.fem_likelihood import FEMLikelihood
 from calibrate.statistical_model.model import Model
 from emulator.accuracy.estimate import newton_distance
-from emulator.accuracy.mesh_error import mesh_error
+from emulator.accuracy.mesh_error import MeshErrorEstimate, mesh_error
 from emulator.core.display import counting
 from emulator.core.errors import InputError, SolverError
 from emulator.fem import Simulator
@@ -169,16 +169,20 @@ def with_error(
     predict = jax.jit(model.predict)
     fem, start = FEMLikelihood(model, simulator), jax.jit(model.full)
     finer = mesh_error(simulator) if of_mesh else None
+    known: list[MeshErrorEstimate] = []
     observe = model.observe if finer is None else on_finer(finer, model.observe)
 
     def solve(draw: Mapping[str, Any]) -> list[jax.Array] | None:
         """Return FEM's displacement in each load state; None where there is none."""
         if finer is None:
             return next(fem.equilibria([draw]))[1]
+        begun = len(known)
         try:
-            return [finer(theta, start(theta)).fine for theta in model.states.thetas(draw)]
+            for theta in model.states.thetas(draw):
+                known.append(finer(theta, start(theta), known=known))
         except SolverError:
             return None
+        return [each.fine for each in known[begun:]]
 
     draws = model.prior_draws(jax.random.key(seed), runs)
     unknowns, errors = [], []
