@@ -32,7 +32,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from calibrate.certificate.estimates import Tests, evidence_of
 from calibrate.certificate.mesh import mesh_change
@@ -50,6 +49,7 @@ from calibrate.samplers.proposals import MOST_TEMPERED, Kernels, key_from, tempe
 from calibrate.statistical_model import FEMLikelihood
 from emulator.core.display import Stages, counting
 from emulator.core.errors import InputError, check_arguments
+from emulator.core.machine import one_blas_thread
 from emulator.fem import Simulator
 from emulator.fem.campaign import executor
 
@@ -125,9 +125,8 @@ def examine(
     predictive = Predictive(posterior.model, posterior.data)
     rng = np.random.default_rng(seed)
     z = predictive.unconstrain(posterior.draws())
-    # More threads than one for small matrices oversubscribe the cores: twice the time.
     with (
-        threadpool_limits(1, user_api="blas"),
+        one_blas_thread(),
         executor(scheduler) as execute,
         counting(total=count, desc="FEM check", disable=not progress, unit="run") as bar,
     ):

@@ -265,9 +265,9 @@ def _at_draws(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return draws z (k, p) of the corrected posterior, and FEM's differences (k, m) there.
 
-    Of many draws those are taken that are farthest from the points before, and from ``known`` ones
-    (n, p): the differences are smooth, so that a point close to another says nothing new. Of
-    ``count`` draws those are returned at which FEM converged on both meshes.
+    Of four draws for each, those are taken that are farthest from the ones before, and from
+    ``known`` points (n, p): the differences are smooth, so that a point close to another says
+    nothing new. Of ``count`` draws those are returned at which FEM converged on both meshes.
     """
     z = pool.z[rng.choice(len(pool.z), size=_CANDIDATES * count, p=pool.corrected)]
     x = pool.predictive.features(np.concatenate([known, z]))

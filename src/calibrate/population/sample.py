@@ -28,6 +28,7 @@ from calibrate.samplers.nuts import NUTS
 from calibrate.samplers.protocol import Context
 from calibrate.statistical_model import Data, Model
 from emulator.core.errors import check_arguments
+from emulator.core.machine import one_blas_thread
 
 _PRIOR_DRAWS = 2000
 # The spread of few members may be near 0, where steps have to be short (docs/experiments.md,
@@ -80,6 +81,7 @@ def hierarchy(
     )
 
 
+@one_blas_thread()
 def sample_population(
     model: PopulationModel,
     data: Mapping[str, Data],

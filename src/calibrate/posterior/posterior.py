@@ -14,7 +14,6 @@ import jax
 import numpy as np
 import numpyro.distributions as dist
 import xarray as xr
-from threadpoolctl import threadpool_limits
 
 from calibrate.arviz import base
 from calibrate.measurements import Observation, Observations, missing_values
@@ -30,6 +29,7 @@ from calibrate.state_names import split
 from calibrate.statistical_model import Data, FEMLikelihood, Model
 from emulator.core.display import TableRepr
 from emulator.core.errors import InputError, check_known
+from emulator.core.machine import one_blas_thread
 from emulator.core.store import write_netcdf
 from emulator.fem import Simulator
 
@@ -202,9 +202,7 @@ def _plain(value: Any) -> str:
     return repr(np.asarray(value).tolist())
 
 
-# Samplers call BLAS with small matrices, and from several threads. With a thread a core in each
-# call, these wait for each other: in L-BFGS-B fifty times as long as they compute.
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_blas_thread()
 def sample(
     model: Model,
     data: np.ndarray | Mapping[str, np.ndarray],

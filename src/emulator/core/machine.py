@@ -8,10 +8,12 @@ explicitly, so their speed is not affected.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import jax
 import jax.numpy as jnp
+from threadpoolctl import threadpool_limits
 
 from emulator.core.errors import InputError
 
@@ -39,6 +41,17 @@ def memory() -> float:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (AttributeError, ValueError, OSError):
         return float("inf")
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Hold BLAS to one thread, as a context or as a decorator of a function.
+
+    For many small matrices, or several threads that call BLAS. With a thread a core in each call,
+    these wait for each other, in L-BFGS-B fifty times as long as they compute.
+    """
+    with threadpool_limits(1, user_api="blas"):
+        yield
 
 
 def require_cpu(what: str) -> None:

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info
 
 import emulator as em
 from emulator.core import machine
@@ -82,3 +83,14 @@ def test_a_network_alone_works_in_float32():
         narrow = np.asarray(forward(jnp.asarray(theta, jnp.float32)))
     assert narrow.dtype == np.float32
     np.testing.assert_allclose(narrow, wide, rtol=1e-5, atol=1e-5)
+
+
+def test_blas_is_held_to_one_thread_and_let_go():
+    def threads():
+        return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+    before, inside = threads(), machine.one_blas_thread()(threads)
+    assert inside() == inside() == {1}
+    with machine.one_blas_thread():
+        assert threads() == {1}
+    assert threads() == before
