@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -128,8 +128,7 @@ class Heights(NamedTuple):
 
 def heights(density: Density, z: np.ndarray, data: Data) -> Heights:
     """Return the log densities at points z (s, p); the program is compiled once a density."""
-    program = _height_program(density)
-    return in_blocks(lambda block: program(block, data), z)
+    return in_blocks(partial(_height_program(density), data=data), z)
 
 
 @lru_cache(maxsize=4)
@@ -138,7 +137,7 @@ def _height_program(density: Density) -> Callable[..., Heights]:
         prior, likelihood = density.log_prior(z), density.log_likelihood(z, data)
         return Heights(without_nan(prior), without_nan(likelihood))
 
-    return jax.jit(lambda z, data: jax.lax.map(lambda row: one(row, data), z, batch_size=BATCH))
+    return jax.jit(lambda z, data: jax.lax.map(partial(one, data=data), z, batch_size=BATCH))
 
 
 @lru_cache(maxsize=4)
