@@ -55,6 +55,9 @@ Differences = Callable[[np.ndarray], Iterable[np.ndarray | None]]
 None where FEM failed on one of the meshes.
 """
 
+CorrectionBy = Callable[..., tuple[Correction, Correction]]
+"""Points and differences to the map's correction and the differences' own: `_corrections_by`."""
+
 
 def points_for(unknowns: int, states: int, most: int | None) -> tuple[int, int]:
     """Return the numbers of points, solved in every load state, that may decide and that end it.
@@ -173,8 +176,9 @@ def change_by(
     while True:
         change = MeshChange(runs=asked, failed=asked - len(z), widened=widened)
         if len(z) >= _FEWEST:
-            fine = fine.corrected_by(correction_by(z, D)[0]).polished(rng, _ROUNDS, cheap=False)
-            value, error = _change(fine, correction_by, z, D)
+            correction, of_mesh = correction_by(z, D)
+            fine = fine.corrected_by(correction).polished(rng, _ROUNDS, cheap=False)
+            value, error = _change(fine, correction_by, z, D, of_mesh)
             names, p = pool.predictive.model.names, len(pool.predictive.model.names)
             figures = as_figures(value, error)
             change = replace(
@@ -201,14 +205,16 @@ def _leaves_no_doubt(change: MeshChange) -> bool:
 
 def _change(
     fine: Pool,
-    correction_by: Callable[..., tuple[Correction, ...]],
+    correction_by: CorrectionBy,
     z: np.ndarray,
     D: np.ndarray,
+    of_mesh: Correction,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return changes of means, in sd, and of log sds, (2 p,), and their errors.
 
     fine : the pool under the correction to the finer mesh's FEM.
     z, D : the points (k, p) at which both meshes were solved, and the differences (k, m).
+    of_mesh : the fit to all differences, whose kernel those with one left out keep.
     """
     # The corrected posterior on the mesh, over the same points.
     before = fine.corrected_by(correction_by(z[:0], D[:0])[0]).corrected
@@ -220,16 +226,15 @@ def _change(
         return np.concatenate([(new - old)[:p] / np.exp(old[p : 2 * p]), (new - old)[p : 2 * p]])
 
     value, error = jackknife(lambda used: change(fine.corrected, used), len(x))
-    like = correction_by(z, D)[1]
     leave_one_out = [
-        change(fine.corrected_by(correction_by(z[remaining], D[remaining], like)[0]).corrected)
+        change(fine.corrected_by(correction_by(z[remaining], D[remaining], of_mesh)[0]).corrected)
         for remaining in ~np.eye(len(z), dtype=bool)
     ]
     variance = np.sum((np.array(leave_one_out) - value) ** 2, axis=0) * (len(z) - 1) / len(z)
     return value, np.hypot(error, np.sqrt(variance))
 
 
-def _corrections_by(predictive: Predictive, runs: Runs) -> Callable[..., tuple[Correction, ...]]:
+def _corrections_by(predictive: Predictive, runs: Runs) -> CorrectionBy:
     """Return the function from points z (k, p) and differences (k, m) to two corrections.
 
     The first one is the map's to FEM on the finer mesh, or without points to FEM on the mesh; the
@@ -265,9 +270,9 @@ def _at_draws(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return draws z (k, p) of the corrected posterior, and FEM's differences (k, m) there.
 
-    Of four draws for each, those are taken that are farthest from the ones before, and from
-    ``known`` points (n, p): the differences are smooth, so that a point close to another says
-    nothing new. Of ``count`` draws those are returned at which FEM converged on both meshes.
+    They are chosen from four times as many: each is the one farthest from those before it and from
+    ``known`` points (n, p). The differences are smooth, so a point close to another says nothing
+    new. Draws at which FEM did not converge on both meshes are left out.
     """
     z = pool.z[rng.choice(len(pool.z), size=_CANDIDATES * count, p=pool.corrected)]
     x = pool.predictive.features(np.concatenate([known, z]))

@@ -35,9 +35,10 @@ from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import minimize
 
 from calibrate.state_names import split
+from emulator.core.machine import one_blas_thread
+from emulator.core.minimise import minimise
 from emulator.scenes.parameter_space import Parameter
 
 LARGEST_SHIFT = 0.5  # posterior sd by which a wider box may move a mean: as for a finer mesh
@@ -68,6 +69,7 @@ class BoxEnd:
         return f"{self.name} at {self.value:.4g} {self.unit}".rstrip()
 
 
+@one_blas_thread()
 def box_ends(draws: Mapping[str, np.ndarray], box: Mapping[str, Parameter]) -> list[BoxEnd]:
     """Return the ends of ranges that end the posterior in place of the data, the worst first.
 
@@ -180,6 +182,5 @@ def _fit(t: np.ndarray) -> tuple[float, float, float]:
         log_norm = float(np.log(norm) + log.max())
         return a @ wanted + log_norm, wanted - statistics @ density / norm
 
-    bound = [(-_STEEPEST, _STEEPEST)] * 2
-    best = minimize(negative, np.zeros(2), jac=True, bounds=bound, method="L-BFGS-B").x
+    best = minimise(negative, np.zeros(2), low=-_STEEPEST, high=_STEEPEST).x
     return negative(best)[0] - float(best @ wanted), float(best[0]), float(best[1])

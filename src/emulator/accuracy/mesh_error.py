@@ -119,8 +119,13 @@ class MeshError:
         coarse = self.simulator.solve(theta, start).require_converged(what).displacement
         prolong = self.finer.refinement.carry
         begin = prolonged = jnp.asarray(prolong(coarse))
-        for weight, other in zip(self._weights(theta, known), known, strict=True):
-            begin = begin + weight * (other.fine - jnp.asarray(prolong(other.coarse)))
+        if known:  # in NumPy: JAX would compile a program for each number of them
+            to_unit = self.simulator.scene.to_unit
+            positions = np.stack([to_unit(other.theta) for other in known])
+            weights = _weights(positions, np.asarray(to_unit(theta)))
+            on_finer = np.tensordot(weights, np.stack([other.fine for other in known]), 1)
+            on_mesh = np.tensordot(weights, np.stack([other.coarse for other in known]), 1)
+            begin = prolonged + (on_finer - prolong(on_mesh))
         # A step solves one set of equations; a scene whose mesh is the loaded shape has two.
         fine_by_steps = (
             None if self.fine.scene.loaded_by else self._fine_by_steps(theta, begin, prolonged)
@@ -133,18 +138,6 @@ class MeshError:
                 solution = self.fine.solve(theta)
         fine = solution.require_converged(f"{what}, on the finer one").displacement
         return MeshErrorEstimate(theta, coarse, fine, solved=True)
-
-    def _weights(self, theta: jax.Array, known: Sequence[MeshErrorEstimate]) -> np.ndarray:
-        """Return the weights of the differences of ``known`` estimates at ``theta`` (p,)."""
-        scene, count = self.simulator.scene, len(known)
-        if not count:
-            return np.zeros(0)
-        x = np.stack([np.asarray(scene.to_unit(other.theta)) for other in known])
-        matrix = np.ones((count + 1, count + 1))
-        matrix[:count, :count] = x @ x.T + _RIDGE * np.eye(count)
-        matrix[count, count] = 0.0
-        right = np.append(x @ np.asarray(scene.to_unit(theta)), 1.0)
-        return np.linalg.solve(matrix, right)[:count]
 
     def forget(self) -> None:
         """Free all factors that are kept: a large mesh's are gigabytes, and would stay."""
@@ -171,6 +164,18 @@ class MeshError:
             if step.accepted and float(left) <= _LEFT * float(jnp.abs(u - prolonged).max()):
                 return u
         return None
+
+
+def _weights(known: np.ndarray, x: np.ndarray) -> np.ndarray:
+    r"""Return the weights (k,) with which known positions (k, p) come closest to ``x`` (p,).
+
+    At the minimum :math:`(X X^T + 10^{-2} I)\, w + \mu = X x` with the multiplier of the sum.
+    """
+    count = len(known)
+    matrix = np.ones((count + 1, count + 1))
+    matrix[:count, :count] = known @ known.T + _RIDGE * np.eye(count)
+    matrix[count, count] = 0.0
+    return np.linalg.solve(matrix, np.append(known @ x, 1.0))[:count]
 
 
 def mesh_error(simulator: Simulator | Scene, *, most: int = LARGEST) -> MeshError:

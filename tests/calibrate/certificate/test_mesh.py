@@ -10,6 +10,7 @@ import calibrate as cal
 import emulator as em
 from calibrate.certificate import examine
 from calibrate.certificate.mesh import _at_draws, change_by, points_for
+from calibrate.certificate.predictive import fit_correction
 from calibrate.certificate.verdict import Figure, MeshChange, judge
 from calibrate.statistical_model import with_error
 from certificate_support import exact_data, exact_posterior, grid_of, linear_model, quadrature
@@ -80,6 +81,16 @@ def test_points_are_doubled_until_every_figure_is_decided(fem, check):
     assert counts == [4]
     assert moved(0.5 / slope).runs == sum(counts) == 40
     assert counts == [4, 4, 8, 16, 8]
+
+
+def test_a_fit_like_another_has_its_kernel():
+    """Wavy errors want a short kernel, a constant one a long; the second is fitted with the first's."""
+    x = np.linspace(-1.0, 1.0, 12)[:, None]
+    wavy = fit_correction(x, np.sin(6.0 * x), np.ones(1), 12)
+    alone = fit_correction(x, x**2, np.ones(1), 12)
+    like = fit_correction(x, x**2, np.ones(1), 12, like=wavy)
+    assert (alone.length, alone.nugget) != (wavy.length, wavy.nugget)
+    assert (like.length, like.nugget) == (wavy.length, wavy.nugget)
 
 
 def test_points_are_far_from_each_other(fem, check):

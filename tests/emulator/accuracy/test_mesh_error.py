@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import emulator as em
+from emulator.accuracy.mesh_error import _weights
 from emulator.core.errors import InputError
 from emulator.scenes.finer import finer
 
@@ -30,6 +31,20 @@ def test_a_finer_scene_has_the_same_problem(coarse):
     np.testing.assert_allclose(
         moved.held_displacement[order], cube.held_displacement[again], atol=1e-12
     )
+
+
+def test_weights_are_the_least_of_the_documented_sum():
+    """On the plane of weights that add up to 1, by least squares; and close to interpolation."""
+    rng = np.random.default_rng(0)
+    known, x = rng.random((6, 3)), np.array([0.4, 0.5, 0.6])
+    plane = np.linalg.svd(np.ones((1, 6)))[2][1:].T
+    rows = np.vstack([known.T @ plane, 0.1 * plane])
+    right = np.append(x - known.mean(axis=0), np.full(6, -0.1 / 6.0))
+    expected = 1.0 / 6.0 + plane @ np.linalg.lstsq(rows, right)[0]
+    weights = _weights(known, x)
+    np.testing.assert_allclose(weights, expected, atol=1e-12)
+    assert weights.sum() == pytest.approx(1.0)
+    np.testing.assert_array_equal(_weights(known[:1], x), [1.0])
 
 
 def test_a_few_steps_find_what_a_solve_on_the_finer_mesh_finds(coarse, error):
