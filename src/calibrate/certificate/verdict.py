@@ -41,6 +41,9 @@ SMALLEST_P_WORST = 0.001
 # Spread of the log ratio of FEM's likelihood over the corrected map's, above which the two are too
 # different whatever the tail; at 1.5 a tenth of the FEM runs would count.
 LARGEST_SPREAD = 1.5
+# Spread up to which few tests are enough: FEM's weights are then the corrected map's to a tenth,
+# and the pool of these has hundreds of effective points.
+_SAME = 0.1
 SMALLEST_POOL = 200.0  # effective points under the corrected map
 # Monte Carlo errors between a figure and its limit. Runs are doubled while they do not decide, and
 # fresh points test at each look, so errors are independent: at 2.4 a figure that is at its limit is
@@ -170,7 +173,7 @@ class Physics:
 class Tail:
     """The importance weights of the FEM runs that test the corrected map.
 
-    k_hat : the Pareto shape of the tail of their weights.
+    k_hat : the Pareto shape of the tail of their weights; NaN for less than 30 runs.
     k_threshold : the largest Pareto shape at which their errors are trusted.
     ess : the effective number of runs.
     largest : the largest weight over the mean weight.
@@ -385,7 +388,7 @@ def _weights(tail: Tail) -> tuple[Verdict, list[Finding]] | None:
         apart = f"the map differs from FEM irregularly, log ratios spread by {tail.spread:.1f}"
         remedy = "train a better map, or put FEM into the likelihood"
         return "not certified", [(apart, remedy)]
-    if np.isnan(tail.k_hat):
+    if np.isnan(tail.k_hat) and not tail.spread <= _SAME:
         few = "too few FEM runs to judge the tail of their weights"
         return "undecided", [(few, "100 FEM runs or more")]
     light = tail.k_hat < tail.k_threshold or tail.largest < NO_TAIL

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.util import find_spec
@@ -91,11 +92,10 @@ def posterior_summary(report: Mapping[str, Any]) -> str:
         lines.append("not checked against FEM yet: calibrate certify")
     else:
         c = report["certificate"]
-        lines.append(
-            f"verdict: {report['verdict']} (Pareto k {c['k_hat']:.2f}, "
-            f"at most {c['k_threshold']:.2f}; {c['draws']} FEM runs, {c['failed']} failed): "
-            f"{c['reason']}"
-        )
+        basis = f"{c['draws']} FEM runs, {c['failed']} failed"
+        if c["k_hat"] is not None and math.isfinite(c["k_hat"]):
+            basis = f"Pareto k {c['k_hat']:.2f}, at most {c['k_threshold']:.2f}; {basis}"
+        lines.append(f"verdict: {report['verdict']} ({basis}): {c['reason']}")
         lines += [f"- {finding}" for finding in c["findings"] if finding != c["reason"]]
     return "\n".join(lines)
 

@@ -14,8 +14,11 @@ plus a combination of the differences :math:`D_i` found at other :math:`\theta_i
 
 .. math:: \min_w \; \Big|\sum_i w_i x_i - x\Big|^2 + 10^{-2}\, |w|^2, \qquad \sum_i w_i = 1
 
-of positions x in the unit box: linear interpolation where they surround theta. A Newton step is
-checked by a second back-substitution (:func:`emulator.accuracy.estimate.newton_distance`), and
+of positions x in the unit box: linear interpolation where they surround theta. Without a known
+difference, the prolonged solution is far from balance: inside a coarse element only the mean strain
+is balanced, and strains vary about it. So two stress iterates
+(:mod:`emulator.fem.stress_iterates`) begin with the mean strain measures of each coarse element.
+A Newton step is checked by a second back-substitution (:func:`emulator.accuracy.estimate.newton_distance`), and
 another step follows if what the second leaves is much. Where steps do not contract, as for locked
 elements far from any known theta, FEM solves on the finer mesh.
 """
@@ -37,6 +40,7 @@ from emulator.core.errors import InputError
 from emulator.fem.compiled import compiled
 from emulator.fem.linear.suitesparse import free_factors
 from emulator.fem.simulator import Simulator
+from emulator.fem.stress_iterates import StressIterates, applies
 from emulator.scenes.finer import Finer, finer
 from emulator.scenes.scene import Scene
 
@@ -48,6 +52,7 @@ _LEFT = 0.02  # largest share of the meshes' difference that the last step may l
 _DIVERGENCE = 0.5  # contraction of a step above which FEM solves instead
 _RIDGE = 1e-2  # of the weights of known differences
 _STEPS = 3  # largest number of steps
+_STRESS_STEPS = 2  # stress iterates before them, without a known difference
 
 Quantity = Callable[[jax.Array, jax.Array], jax.Array]
 
@@ -127,9 +132,10 @@ class MeshError:
             on_mesh = np.tensordot(weights, np.stack([other.coarse for other in known]), 1)
             begin = prolonged + (on_finer - prolong(on_mesh))
         # A step solves one set of equations; a scene whose mesh is the loaded shape has two.
-        fine_by_steps = (
-            None if self.fine.scene.loaded_by else self._fine_by_steps(theta, begin, prolonged)
-        )
+        fine_by_steps = None
+        if not self.fine.scene.loaded_by:
+            near = begin if known else self._nearer(theta, prolonged)
+            fine_by_steps = self._fine_by_steps(theta, near, prolonged)
         if fine_by_steps is not None:
             return MeshErrorEstimate(theta, coarse, fine_by_steps, solved=False)
         with self._alone:
@@ -142,6 +148,27 @@ class MeshError:
     def forget(self) -> None:
         """Free all factors that are kept: a large mesh's are gigabytes, and would stay."""
         free_factors()
+
+    def _nearer(self, theta: jax.Array, prolonged: jax.Array) -> jax.Array:
+        """Return the displacement (f, 3) mm after stress iterates from the ``prolonged`` one.
+
+        The prolonged one itself where the law has none, or a tangent is indefinite.
+        """
+        system = self.fine.system
+        if not applies(system.scene):
+            return prolonged
+        iterates = StressIterates(system, self.fine.options.shrink, theta, jnp.ones(()))
+        state = iterates.begin(prolonged)
+        every = state.measures  # (m, q, k); the children of a coarse element follow each other
+        points = self.finer.refinement.children * every.shape[1]
+        of_parents = every.reshape(-1, points, every.shape[2])
+        means = jnp.broadcast_to(of_parents.mean(axis=1, keepdims=True), of_parents.shape)
+        state = state._replace(measures=means.reshape(every.shape))
+        for _ in range(_STRESS_STEPS):
+            state = iterates.step(state, jnp.ones(()))
+            if not bool(state.definite):
+                return prolonged
+        return state.u
 
     @cached_property
     def _step(self) -> Callable[[jax.Array, jax.Array], Distance]:

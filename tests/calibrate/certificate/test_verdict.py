@@ -83,10 +83,16 @@ def test_a_heavy_tail_is_undecided_and_an_irregular_map_is_not_certified():
     heavy = replace(RIGHT.tail, k_hat=0.8, largest=20.0)
     assert verdict(tail=heavy)[0] == "undecided"
     assert verdict(tail=replace(heavy, largest=2.0))[0] == "accepted"  # k-hat cries wolf
-    # A number that is not there is not good news, however even the weights look.
-    found, words = verdict(tail=replace(RIGHT.tail, k_hat=np.nan))
+    # Few runs have no tail of their own; where the map is FEM's to a tenth, the pool's decides.
+    few = replace(RIGHT.tail, k_hat=np.nan, spread=0.2)
+    found, words = verdict(tail=few)
     assert found == "undecided"
     assert "too few FEM runs to judge the tail of their weights: 100 FEM runs or more" in words
+    assert verdict(tail=replace(few, spread=np.nan))[0] == "undecided"
+    same = replace(few, spread=0.05)
+    assert verdict(tail=same)[0] == "accepted"
+    assert verdict(tail=replace(same, largest=7.0))[0] == "undecided"
+    assert verdict(tail=replace(same, pool=50.0))[0] == "undecided"
     assert verdict(tail=replace(RIGHT.tail, pool=50.0))[0] == "undecided"
     assert verdict(tail=replace(RIGHT.tail, spread=3.0))[0] == "not certified"
     assert verdict(tail=replace(RIGHT.tail, spread=np.inf, ess=0.0))[0] == "not certified"
