@@ -8,8 +8,8 @@ follows that posterior. The change is from the corrected posterior to this one, 
 of the pool. Its error is the jackknife's over the solves on the finer mesh, and over the pool.
 
 Solves on the finer mesh are dear. The first four points lie in the corrected posterior; where they
-leave no doubt, with twice the margin, there are no others. Otherwise as many again follow, in the
-posterior under the finer mesh's FEM as it is known by then, until every figure is decided.
+leave no doubt, with twice the margin, there are no others. Otherwise half as many again follow, in
+the posterior under the finer mesh's FEM as it is known by then, until every figure is decided.
 """
 
 from __future__ import annotations
@@ -190,7 +190,7 @@ def change_by(
         decided = not comparisons or all_within(comparisons) is not None
         if asked >= most or (decided and asked >= enough) or _leaves_no_doubt(change):
             return change
-        more = min(asked, most - asked)
+        more = min(max(asked // 2, 1), most - asked)
         more_z, more_D = _at_draws(differences, fine, more, rng, z)
         asked, z, D = asked + more, np.concatenate([z, more_z]), np.concatenate([D, more_D])
 

@@ -14,6 +14,7 @@ import os
 import platform
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import jax
@@ -129,10 +130,30 @@ def keep_programs(environment: Mapping[str, str] = os.environ) -> Path | None:
     except OSError as error:
         print(f"calibrate: compiled programs are not kept: {folder}: {error}", file=sys.stderr)
         return None
+    _prune(folder)
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_compilation_cache_max_size", LARGEST)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", _LEAST_SECONDS)
     return folder
+
+
+def _prune(folder: Path) -> None:
+    """Delete the files of ``folder`` that were used longest ago, where all exceed a gigabyte.
+
+    JAX can bound the size itself, but then reads the time of every program for each one it writes:
+    a first command would spend a third of its time on that.
+    """
+    files = []
+    for path in folder.iterdir():
+        with suppress(OSError):  # another command may have deleted it
+            status = path.stat()
+            files.append((max(status.st_atime, status.st_mtime), status.st_size, path))
+    excess = sum(size for _, size, _ in files) - LARGEST
+    for _, size, path in sorted(files):
+        if excess <= 0:
+            break
+        with suppress(OSError):
+            path.unlink()
+        excess -= size
 
 
 def program_folder(environment: Mapping[str, str]) -> Path | None:

@@ -7,7 +7,7 @@ import sys
 import jax
 import pytest
 
-from calibrate.cli import keep_programs, program_folder
+from calibrate.cli import _prune, keep_programs, program_folder
 
 CALL = "import sys; from calibrate.cli import main; sys.exit(main(sys.argv[1:]))"
 WORDS = ("simulate", "once_clamped_beam", "--theta", "mu=70", "lam=80", "--json")
@@ -72,3 +72,14 @@ def test_a_folder_that_cannot_be_is_said_and_does_no_harm(tmp_path):
     assert done.returncode == 0
     assert "compiled programs are not kept" in done.stderr
     assert len(done.stderr.splitlines()) == 1
+
+
+def test_programs_used_longest_ago_are_deleted(tmp_path, monkeypatch):
+    monkeypatch.setattr("calibrate.cli.LARGEST", 250)
+    for age, name in enumerate(("new-cache", "used-cache", "old-cache", "oldest-cache")):
+        path = tmp_path / name
+        path.write_bytes(bytes(100))
+        os.utime(path, (1e9 - age, 1e9 - age))
+    os.utime(tmp_path / "used-cache", (2e9, 1e9))
+    _prune(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"new-cache", "used-cache"}
