@@ -256,7 +256,7 @@ INFERENCES = [
     ("--data inf.csv", "row 2 has a displacement that is not finite"),
     ("--data gone.csv", "gone.csv: data: every value of displacement is missing"),
     ("--data node.csv", "node 4000 is unknown"),
-    ("--data book.xlsx", "book.xlsx is a spreadsheet; save it as CSV"),
+    ("--data book.xlsx", "book.xlsx is not a readable spreadsheet"),
     ("--data metres.csv", "m instead of mm? multiply by 1000"),
     ("--data centimetres.csv", "cm instead of mm? multiply by 10 "),
     ("--data zero.csv", "displacement data are all zero; predictions reach"),

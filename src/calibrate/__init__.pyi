@@ -20,6 +20,7 @@ from .measurements import (
     segment_strains,
     spread_landmarks,
     strains,
+    stresses,
     surface_distances,
     surface_points,
 )
@@ -138,6 +139,7 @@ __all__ = [
     "spread_landmarks",
     "strains",
     "stress_band",
+    "stresses",
     "surface_distances",
     "surface_points",
     "truncated",

@@ -21,9 +21,11 @@ from .mechanics.laws import find_law
 from .scenes import Parameter, Scene, Support, loads, supports
 from .scenes.draft import draft_scene
 from .scenes.finer import finer
+from .scenes.specimen import specimen
 from .surrogates import Emulator, load, save_emulator, shipped
 from .surrogates.corrected import corrected
 from .surrogates.fem import FEMForward, fem_forward
+from .surrogates.homogeneous import homogeneous
 from .surrogates.pod_gp import fit_reduced
 from .surrogates.protocol import ForwardMap, Prediction
 from .surrogates.released_network import released_network
@@ -67,6 +69,7 @@ __all__ = [
     "finer",
     "fit_reduced",
     "generators",
+    "homogeneous",
     "laws",
     "load",
     "loads",
@@ -83,6 +86,7 @@ __all__ = [
     "scenes",
     "shipped",
     "side_by_side",
+    "specimen",
     "strain_energy",
     "supports",
     "train",

@@ -34,6 +34,7 @@ from calibrate.measurements.parameter import MeasuredParameter
 from calibrate.measurements.points import DISPLACEMENT
 from calibrate.measurements.reaction import Reaction
 from calibrate.measurements.strain import SegmentStrain, Strain, segment_strains, strains
+from calibrate.measurements.stress import Stress, stresses
 from calibrate.measurements.surface import (
     RigidMarkers,
     SurfacePoints,
@@ -61,6 +62,7 @@ OBSERVATIONS: dict[str, type[Observation]] = {
         KlotzVolume,
         Length,
         Reaction,
+        Stress,
         MeasuredParameter,
     )
 }
@@ -77,6 +79,7 @@ __all__ = [
     "Observations",
     "Reaction",
     "Scalar",
+    "Stress",
     "landmarks",
     "leave_out_missing",
     "length_between",
@@ -91,6 +94,7 @@ __all__ = [
     "spread_nodes",
     "spread_on_surface",
     "strains",
+    "stresses",
     "surface_distances",
     "surface_points",
 ]

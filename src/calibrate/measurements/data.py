@@ -32,7 +32,6 @@ from calibrate.measurements import OBSERVATIONS
 from calibrate.measurements.collection import Observations, check_some, observations
 from calibrate.measurements.observation import Block, Observation, Table
 from calibrate.measurements.tables import (
-    TEXT,
     DataTable,
     read_csv,
     read_netcdf,
@@ -40,10 +39,11 @@ from calibrate.measurements.tables import (
     write_netcdf,
 )
 from calibrate.state_names import in_state, split
+from emulator.core.cells import SPREADSHEETS, TEXT
 from emulator.core.errors import InputError
 from emulator.scenes.scene import Scene
 
-_SPREADSHEETS = (".xlsx", ".xls", ".ods")
+_OTHER_SPREADSHEETS = (".xls", ".ods")
 
 Reader = Callable[[Path], Mapping[str, DataTable]]
 """Maps a file to the table of each of its load states."""
@@ -75,9 +75,10 @@ def read_measurements(
         file = Path(path)
         if not file.is_file():
             raise InputError(f"data file {path} does not exist")
-        if file.suffix.lower() in _SPREADSHEETS:
+        if file.suffix.lower() in _OTHER_SPREADSHEETS:
             raise InputError(f"data file {path} is a spreadsheet; save it as CSV")
-        read: Reader = read_csv if file.suffix.lower() in TEXT else read_netcdf
+        of_cells = file.suffix.lower() in (*TEXT, *SPREADSHEETS)
+        read: Reader = read_csv if of_cells else read_netcdf
         for own, table in read(file).items():
             state = ".".join(filter(None, (given, own)))
             known |= {in_state(name, state): value for name, value in table.known.items()}

@@ -1,18 +1,15 @@
-"""Data files as named arrays: CSV in its dialects, and netCDF.
+"""Data files as named arrays: CSV and spreadsheets (:mod:`emulator.core.cells`), and netCDF.
 
-A CSV file has one header line, and columns separated by commas, semicolons or tabs, whichever the
-header has; with the latter two, numbers may have decimal commas. Blanks around words, empty lines
-and lines that begin with ``#`` are ignored. Which columns there are says
-:mod:`calibrate.measurements.data`; nodes and positions may not be missing.
+Which columns there are says :mod:`calibrate.measurements.data`; nodes and positions may not be
+missing.
 """
 
 from __future__ import annotations
 
 import csv
 import io
-import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +18,7 @@ import xarray as xr
 from calibrate.measurements.observation import Block, Field
 from calibrate.state_names import in_state, split, states_of
 from emulator.core import store
+from emulator.core.cells import TEXT, Cells, read_cells
 from emulator.core.errors import InputError
 
 STATE = "state"
@@ -30,25 +28,28 @@ KNOWN = "known:"
 """Before a parameter's name: a column of its value, where that is known."""
 
 _PLACES = {"node", "x", "segment"}  # columns of tables whose rows are places, not load states
-TEXT = (".csv", ".tsv", ".txt")
-_MISSING = ("", "na", "n/a", "nan")
 
 
 @dataclass(frozen=True)
 class CSVTable:
-    """Columns of a CSV file in one of its load states.
+    """Columns of a table of text in one of its load states.
 
-    words : the names of the columns.
-    rows : the text of each cell by column, by the row's number, from 1 after the header.
-    decimal_comma : whether numbers may have decimal commas.
+    cells : the columns and rows of that state.
     what : the word for a column, for errors.
     """
 
-    path: Path
-    words: Sequence[str]
-    rows: Mapping[int, Mapping[str, str]]
-    decimal_comma: bool
+    cells: Cells
     what: str = "column"
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return self.cells.path
+
+    @property
+    def words(self) -> Sequence[str]:
+        """The names of the columns."""
+        return self.cells.words
 
     @property
     def known(self) -> dict[str, float]:
@@ -59,8 +60,8 @@ class CSVTable:
         values: dict[str, float] = {}
         for word in (w for w in self.words if w.startswith(KNOWN)):
             name = word.removeprefix(KNOWN)
-            for number in (number for number, row in self.rows.items() if row[word]):
-                value = self._number(number, word)
+            for number in (number for number, row in self.cells.rows.items() if row[word]):
+                value = self.cells.number(number, word)
                 if values.setdefault(name, value) != value:
                     raise InputError(
                         f"data file {self.path}: row {number}, column '{word}' is {value}, and "
@@ -83,30 +84,17 @@ class CSVTable:
         places = [word for field in fields if field.where for word in field.columns]
         rows = [
             k
-            for k, row in self.rows.items()
+            for k, row in self.cells.rows.items()
             if any(row[w] for w in measured)
             or (any(row[w] for w in places) and not any(row[w] for w in others))
         ]
         arrays = {}
         for field in fields:
             words, gaps = field.columns, not field.where
-            numbers = [[self._number(k, word, gaps=gaps) for word in words] for k in rows]
+            numbers = [[self.cells.number(k, word, gaps=gaps) for word in words] for k in rows]
             array = np.array(numbers, dtype=float).reshape(len(rows), len(words))
             arrays[field.variable] = array[:, 0] if len(words) == 1 else array
         return arrays
-
-    def _number(self, number: int, word: str, *, gaps: bool = False) -> float:
-        """Return the number in a row and column; NaN where it is missing and may be."""
-        cell = self.rows[number][word]
-        if gaps and cell.lower() in _MISSING:
-            return np.nan
-        try:
-            return float(cell.replace(",", ".") if self.decimal_comma and "." not in cell else cell)
-        except ValueError as error:
-            fault = f"'{cell}', not a number" if cell else "empty"
-            raise InputError(
-                f"data file {self.path}: row {number}, column '{word}' is {fault}"
-            ) from error
 
 
 def read_csv(path: Path) -> dict[str, CSVTable]:
@@ -114,40 +102,12 @@ def read_csv(path: Path) -> dict[str, CSVTable]:
 
     One empty name where the file names no state.
     """
-    lines = _lines(path)
-    header = re.sub(r'"[^"]*"', "", lines[0]) if lines else ""  # quoted text does not count
-    delimiter = next((mark for mark in ";\t" if mark in header), ",")
-    try:
-        table = csv.reader(io.StringIO("\n".join(lines)), delimiter=delimiter, strict=True)
-        words, *cells = [[cell.strip() for cell in row] for row in table] or [[]]
-    except csv.Error as error:
-        raise InputError(f"data file {path} is not a CSV file: {error}") from error
-    if words and all(map(_is_number, words)):
-        raise InputError(
-            f"data file {path}: its first line, '{lines[0].strip()[:40]}', has no names "
-            "of columns; put them above it, e.g. node,ux,uy,uz"
-        )
-    for word in words:
-        if word and words.count(word) > 1:
-            raise InputError(f"data file {path}: column '{word}' is there twice")
-    rows: dict[int, dict[str, str]] = {}
-    for number, row in enumerate(cells, 1):
-        if any(row[len(words) :]):
-            hint = "; decimal commas need semicolons between columns" if delimiter == "," else ""
-            raise InputError(
-                f"data file {path}: row {number} has {len(row)} values for {len(words)} "
-                f"columns{hint}"
-            )
-        if any(row) or len(row) > 1:
-            padded = row + [""] * (len(words) - len(row))
-            rows[number] = dict(zip(words, padded, strict=False))
-    if words and not rows:
-        raise InputError(f"data file {path}: names of columns, and no row below them")
-    whole = CSVTable(path, words, rows, decimal_comma=delimiter != ",")
+    whole = read_cells(path)
+    words, rows = whole.words, whole.rows
     curve = any(w.startswith(KNOWN) for w in words) and not {STATE, *_PLACES} & set(words)
     if STATE not in words and not curve:
-        return {"": whole}
-    states: dict[str, dict[int, dict[str, str]]] = {}
+        return {"": CSVTable(whole)}
+    states: dict[str, dict[int, Mapping[str, str]]] = {}
     for number, cell in rows.items():
         state = str(number) if curve else cell[STATE]
         if not state or "@" in state or "/" in state:
@@ -158,33 +118,14 @@ def read_csv(path: Path) -> dict[str, CSVTable]:
         states.setdefault(state, {})[number] = cell
     # A column that is empty in a state was not measured there.
     return {
-        state: replace(
-            whole,
-            words=[w for w in words if w != STATE and any(row[w] for row in own.values())],
-            rows=own,
+        state: CSVTable(
+            whole._replace(
+                words=[w for w in words if w != STATE and any(row[w] for row in own.values())],
+                rows=own,
+            )
         )
         for state, own in states.items()
     }
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word.replace(",", "."))
-    except ValueError:
-        return False
-    return True
-
-
-def _lines(path: Path) -> list[str]:
-    """Return the lines that are neither empty nor comments, the header first."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"data file {path} is not UTF-8 text; save it as CSV UTF-8") from error
-    if "\0" in text:
-        raise InputError(f"data file {path} is not a CSV file: it holds bytes that are no text")
-    lines = [line.strip(" \r") for line in text.split("\n")]
-    return [line for line in lines if line.strip() and not line.startswith("#")]
 
 
 @dataclass(frozen=True)

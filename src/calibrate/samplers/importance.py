@@ -58,6 +58,9 @@ from emulator.core.errors import SolverError
 
 _PRIOR = 1024  # draws of the prior that a population begins with
 _FOUND = 200.0  # effective points from which a proposal is fitted
+# Evaluations by which a population has found them, or is stuck: the time of its steps grows as
+# their square (docs/experiments.md, "Populations that are stuck").
+_MOST_SEARCHED = 16_000
 _FITS, _MOST_FITS = 2, 6
 _LIGHT = 0.5  # Pareto shape of the weights of a good fit: their variance is finite
 _FITTED_TO = 4096  # points, resampled, that a proposal is fitted to
@@ -157,8 +160,10 @@ class _Run:
         """Move from the prior to the posterior, and fit a proposal there."""
         while True:  # one step at least: proposals are better than the prior
             self._go_to(self.points.stepped(self.points.log_weights, self._rng), STEP)
-            if effective_number(self.points.log_weights) >= _FOUND:
+            if (worth := effective_number(self.points.log_weights)) >= _FOUND:
                 break
+            if self.evaluations > _MOST_SEARCHED:
+                raise self._failure(worth)
         for fits in range(1, _MOST_FITS + 1):
             self.fit(self.points.z, self.points.log_weights)
             if fits >= _FITS and pareto_shape(self.points.log_weights) < _LIGHT:
@@ -179,11 +184,13 @@ class _Run:
         """Take the points, which took so many evaluations more."""
         self.points, self.evaluations = points, self.evaluations + evaluations
         if self.evaluations > self._options.evaluations:
-            worth = effective_number(points.log_weights)
-            raise SolverError(
-                f"importance: the points of a population are worth {worth:.0f} draws after "
-                f"{self.evaluations} evaluations; use nuts or smc, or allow more evaluations"
-            )
+            raise self._failure(effective_number(points.log_weights))
+
+    def _failure(self, worth: float) -> SolverError:
+        return SolverError(
+            f"importance: the points of a population are worth {worth:.0f} draws after "
+            f"{self.evaluations} evaluations; use nuts or smc, or allow more evaluations"
+        )
 
 
 def _of_all(runs: list[_Run]) -> tuple[np.ndarray, np.ndarray]:

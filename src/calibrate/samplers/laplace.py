@@ -214,7 +214,8 @@ def find_modes(
 
     def negative(w: np.ndarray) -> tuple[float, np.ndarray]:
         height, slope = programs.value_and_gradient(jnp.asarray(factor @ w), data)
-        return -float(height), -(np.asarray(slope) @ factor)
+        with np.errstate(invalid="ignore"):  # far away, where the slope is not finite
+            return -float(height), -(np.asarray(slope) @ factor)
 
     minima = [
         minimise(negative, np.linalg.solve(factor, start), iterations=_MOST, tolerance=1e-12)

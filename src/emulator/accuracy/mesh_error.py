@@ -18,9 +18,10 @@ of positions x in the unit box: linear interpolation where they surround theta. 
 difference, the prolonged solution is far from balance: inside a coarse element only the mean strain
 is balanced, and strains vary about it. So two stress iterates
 (:mod:`emulator.fem.stress_iterates`) begin with the mean strain measures of each coarse element.
-A Newton step is checked by a second back-substitution (:func:`emulator.accuracy.estimate.newton_distance`), and
-another step follows if what the second leaves is much. Where steps do not contract, as for locked
-elements far from any known theta, FEM solves on the finer mesh.
+A Newton step is checked by a second back-substitution
+(:func:`emulator.accuracy.estimate.newton_distance`), and another step follows if what the second
+leaves is much. Where steps do not contract, as for locked elements far from any known theta, FEM
+solves on the finer mesh.
 """
 
 from __future__ import annotations

@@ -19,6 +19,8 @@ from emulator.mechanics.laws import Law, find_law
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
 from emulator.scenes.scene_data import directions_read
+from emulator.scenes.specimen import body_of, read_states
+from emulator.scenes.supports.dirichlet import Support
 
 if TYPE_CHECKING:  # pydantic is imported when a scene file is read, not with the package
     from emulator.core.schema import Source
@@ -46,7 +48,14 @@ def read_scene(path: str | Path) -> Scene:
     file = parse(SceneFile, source)
     with source.at("law"):
         law = find_law(file.law)
-    body, regions = (_several_bodies if file.bodies else _one_body)(path.parent, file, law, source)
+    supports, regions = file.supports, None
+    if file.specimen is not None:
+        body, supports = _specimen(path.parent, file, source)
+    elif not supports:
+        raise source.error("key 'supports' is missing; expected tables [[supports]]")
+    else:
+        read = _several_bodies if file.bodies else _one_body
+        body, regions = read(path.parent, file, law, source)
     mesh, fibres, sheets = _with_planes(body.mesh, file, source), body.fibres, body.sheets
     if file.fibres is not None:
         with source.at("fibres", table=("fibres",)):
@@ -69,13 +78,24 @@ def read_scene(path: str | Path) -> Scene:
             regions=regions,
             parameters=tuple(parameters),
             loads=file.loads,
-            supports=file.supports,
+            supports=supports,
             constants=file.constants,
             dilatation=file.dilatation,
             loaded_by=file.loaded_by,
         )
     except InputError as error:
         raise source.error(str(error), _quantity_in(str(error), file)) from error
+
+
+def _specimen(folder: Path, file: SceneFile, source: Source) -> tuple[Body, tuple[Support, ...]]:
+    """Return the states of the table ``specimen`` as bodies, and the supports that hold them."""
+    for key in ("mesh", "bodies", "regions", "supports", "loads", "order"):
+        if key in source.data:
+            raise source.error("a specimen has none; it is held and moved by its table", (key,))
+    with source.at("specimen"):
+        assert file.specimen is not None
+        mesh, supports = body_of(read_states(folder / file.specimen))
+    return Body(mesh), supports
 
 
 def _one_body(folder: Path, file: SceneFile, law: Law, source: Source) -> tuple[Body, Regions]:

@@ -61,10 +61,13 @@ class SceneFile(Table):
     """mesh file of tetrahedra in mm, any format meshio reads; its path is relative to this file."""
     bodies: tuple[BodyTable, ...] = ()
     """several bodies of one material, in place of mesh."""
+    specimen: str | None = None
+    """in place of mesh, a table (CSV or spreadsheet) of the states of a tested specimen, relative
+    to this file: docs/specimens.md."""
     parameters: dict[str, ParameterTable]
     """what varies: parameters of the law, of loads and of regions."""
-    supports: tuple[Annotated[BoundaryCondition, OneOf("kind", SUPPORTS, "held")], ...]
-    """what holds the body; a table without a kind holds a node set."""
+    supports: tuple[Annotated[BoundaryCondition, OneOf("kind", SUPPORTS, "held")], ...] = ()
+    """what holds the body; a table without a kind holds a node set. A specimen has none."""
     loads: tuple[Annotated[Load, OneOf("kind", LOADS)], ...] = ()
     """what moves the body."""
     constants: dict[str, float] = Field(default_factory=dict)
@@ -104,7 +107,8 @@ def scene_schema() -> dict[str, Any]:
     keys["constants"]["properties"] = {
         name: {"type": "number", "description": text} for name, text in texts.items()
     }
-    one_mesh = {"oneOf": [{"required": ["mesh"]}, {"required": ["bodies"]}]}
+    held = [{"required": [key, "supports"]} for key in ("mesh", "bodies")]
+    one_mesh = {"oneOf": [*held, {"required": ["specimen"], "not": {"required": ["supports"]}}]}
     units = [_units(law) for law in LAWS.values()]
     return {"title": "Scene file", **schema, "allOf": [one_mesh, *units]}
 

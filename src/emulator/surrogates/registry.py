@@ -15,11 +15,12 @@ from emulator.core.store import read_arrays, save_arrays
 from emulator.surrogates.corrected import CORRECTED
 from emulator.surrogates.emulator import EMULATOR
 from emulator.surrogates.fem import FEM
+from emulator.surrogates.homogeneous import HOMOGENEOUS, INCOMPRESSIBLE
 from emulator.surrogates.pod_gp import REDUCED
 from emulator.surrogates.protocol import ForwardKind, ForwardMap, Ingredients, Option
 
 FORWARD_MAPS: dict[str, ForwardKind] = {
-    kind.name: kind for kind in (EMULATOR, CORRECTED, REDUCED, FEM)
+    kind.name: kind for kind in (EMULATOR, CORRECTED, REDUCED, FEM, HOMOGENEOUS, INCOMPRESSIBLE)
 }
 
 

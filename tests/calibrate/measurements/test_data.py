@@ -180,7 +180,7 @@ def test_dialects_of_csv(beam, tmp_path, text):
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("d.xlsx", b"PK\x03\x04", "d.xlsx is a spreadsheet; save it as CSV"),
+        ("d.xlsx", b"PK\x03\x04", "d.xlsx is not a readable spreadsheet"),
         ("d.csv", b"PK\x03\x04\x00", "is not a CSV file: it holds bytes"),
         ("d.csv", "n\u00f6de,ux".encode("latin-1"), "is not UTF-8 text"),
         ("d.csv", b"node,ux,uy,uz\n7,0,5,2,25,3\n", "row 1 has 6 values for 4 columns; decimal"),

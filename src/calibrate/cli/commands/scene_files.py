@@ -15,25 +15,30 @@ from typing import Any
 from calibrate.cli import words
 from calibrate.cli.output import table
 from calibrate.cli.words import Answer, command, option
+from emulator.core.errors import InputError
 from emulator.core.store import check_folder, to_json
 
 
 @command(
-    option("mesh", "MESH", "mesh file of tetrahedra"),
-    option("--out", "FILE.toml", "scene file to write (default: beside the mesh)"),
+    option("mesh", "FILE", "mesh of tetrahedra, or the table of a specimen's test"),
+    option("--out", "FILE.toml", "file to write (default: beside the first)"),
     option("--unit", "mm|cm|m|um", "of the mesh's coordinates (default: guessed, and said)"),
     option("--law", "NAME", "default: by whether there are fibres"),
-    help="a first scene file for your mesh",
+    help="first files for your mesh, or for the table of a test",
     description="Reads a mesh (gmsh, VTU and whatever meshio reads), says which sets it has, "
-    "guesses from their names and from its size, says so, and writes a commented scene file.",
+    "guesses from their names and from its size, says so, and writes a commented scene file. Of a "
+    "table (CSV or xlsx) of stretches and stresses it writes a scene and an experiment file.",
     epilog="example: calibrate init ventricle.msh, then calibrate simulate ventricle.toml",
 )
 def init(arguments: Namespace) -> Answer:
     """Write the scene file, and say what the mesh has."""
+    from emulator.core.cells import SPREADSHEETS, TEXT
     from emulator.scenes.draft import draft_scene
 
     mesh_path = Path(arguments.mesh)
     out = arguments.out or mesh_path.parent / f"{mesh_path.stem or 'scene'}.toml"
+    if mesh_path.suffix.lower() in (*TEXT, *SPREADSHEETS):
+        return _init_specimen(mesh_path, out, arguments)
     draft = draft_scene(arguments.mesh, out, unit=arguments.unit, law=arguments.law)
     scene, mesh = draft.scene, draft.scene.mesh
     facets = {name: len(rows) for name, rows in mesh.facet_sets.items()}
@@ -54,6 +59,31 @@ def init(arguments: Namespace) -> Answer:
         f"sets: {', '.join(sets) or 'none'}",
         *draft.notes,
         f"written to {draft.path}; look for CHANGE in it, then: calibrate simulate {draft.path}",
+    ]
+    return Answer(result, "\n".join(lines))
+
+
+def _init_specimen(table_path: Path, out: str | Path, arguments: Namespace) -> Answer:
+    """Write the files for a table, and say what was guessed."""
+    from calibrate.project.specimen import draft_specimen
+
+    if arguments.unit is not None:
+        raise InputError(
+            "--unit has no effect on a table: its columns have units, 'stress_x [MPa]'"
+        )
+    draft = draft_specimen(table_path, out, law=arguments.law)
+    result = {
+        "out": str(draft.path),
+        "scene": str(draft.scene_path),
+        "states": len(draft.scene.mesh.elements),
+        "law": draft.scene.law.name,
+        "parameters": list(draft.scene.parameter_names),
+        "notes": list(draft.notes),
+    }
+    lines = [
+        *draft.notes,
+        f"written to {draft.path} and {draft.scene_path}; look for CHANGE in the latter, then: "
+        f"calibrate infer {draft.path} --out RUN",
     ]
     return Answer(result, "\n".join(lines))
 

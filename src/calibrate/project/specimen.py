@@ -1,0 +1,176 @@
+"""First files for a table of a mechanical test: its scene, and its experiment."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from calibrate.measurements.data import read_measurements
+from calibrate.measurements.stress import Stress
+from emulator.core.cells import read_cells
+from emulator.core.errors import InputError
+from emulator.mechanics.laws import Law, find_law
+from emulator.mechanics.laws.law import Quantity
+from emulator.scenes.file import read_scene
+from emulator.scenes.parameter_space import Parameter
+from emulator.scenes.scene import Scene
+from emulator.scenes.specimen import AXES, States, read_states, specimen
+
+_MODULI = (0.005, 3.0)  # range of a modulus, as a share of the largest stress over its strain
+_EXPONENTS = (0.1, 50.0)
+_KAPPA = 1000.0  # bulk modulus, likewise
+_NOISE = 0.03  # scale of both sds of the noise, as a share of the largest stress
+_LENGTH = 0.1  # over which errors along a curve correlate, in stretch
+
+
+class SpecimenDraft(NamedTuple):
+    """Files that were written.
+
+    path, scene_path : the experiment file, and the scene file that it names.
+    scene : the scene that the latter describes.
+    notes : sentences, one for each guess.
+    """
+
+    path: Path
+    scene_path: Path
+    scene: Scene
+    notes: tuple[str, ...]
+
+
+def draft_specimen(table: str | Path, out: str | Path, *, law: str | None = None) -> SpecimenDraft:
+    """Write a scene file and an experiment file for a table of a specimen's test.
+
+    Parameters
+    ----------
+    table : a CSV file or spreadsheet, see :mod:`emulator.scenes.specimen` and
+        :mod:`calibrate.measurements.stress` for its columns.
+    out : the experiment file, ``NAME.toml``; the scene is ``NAME_scene.toml`` beside it.
+    law : name of the law; by default two families of fibres for tests that pull along two axes,
+        an isotropic exponential else.
+
+    Raises
+    ------
+    InputError
+        A table that cannot be read, an unknown law, or a file that exists already.
+    """
+    table, out = Path(table), Path(out)
+    scene_path = out.with_name(f"{out.stem}_scene.toml")
+    if out.suffix != ".toml":
+        raise InputError(f"--out {out}: the file name must end in .toml")
+    for path in (out, scene_path):
+        if path.exists():
+            raise InputError(f"{path} is there already; remove it or give --out another name")
+    if not table.is_file():
+        raise InputError(f"data file {table} does not exist")
+    given = read_states(table)
+    largest, slope = _size(table, given)
+    axes = [a for k, a in enumerate(AXES) if (np.abs(given.gradients[:, k, k]) > 0.0).any()]
+    chosen = "holzapfel_gasser_ogden" if len(axes) > 1 else "holzapfel_ogden_isotropic"
+    material = find_law(law or chosen)
+    notes = [
+        f"{len(given.free)} states in {_tests(given)}",
+        f"law {material.name}" + ("" if law else ": a guess, give --law NAME"),
+        f"stresses reach {largest:.3g} kPa: ranges of moduli and the noise follow from that",
+        "incompressible, --forward homogeneous takes the law's kappa; FEM, which checks, takes it, "
+        "too",
+        f"errors along a curve correlate over {_LENGTH:g} of stretch, their sds are inferred",
+    ]
+    left_out = len(_every_row(table)) - len(given.free)
+    if left_out:
+        notes.insert(1, f"{left_out} rows of unloading are left out")
+    folder = scene_path.resolve().parent
+    source = table.resolve()
+    name = source.relative_to(folder) if source.is_relative_to(folder) else source
+    scene_path.parent.mkdir(parents=True, exist_ok=True)
+    scene_path.write_text(_scene_text(material, name.as_posix(), axes, slope), encoding="utf-8")
+    try:
+        scene = read_scene(scene_path)
+    except InputError:
+        scene_path.unlink()
+        raise
+    out.write_text(_experiment_text(scene_path.name, name.as_posix(), largest, notes), "utf-8")
+    return SpecimenDraft(out, scene_path, scene, tuple(notes))
+
+
+def _every_row(table: Path) -> list[int]:
+    return list(read_cells(table, unloading=True).rows)
+
+
+def _tests(given: States) -> str:
+    names = [name for name in given.protocols if name]
+    return f"{len(names)} tests ({', '.join(names)})" if len(names) > 1 else "one test"
+
+
+def _size(table: Path, given: States) -> tuple[float, float]:
+    """Return the largest stress of the table in kPa, and the largest over the motion there."""
+    neutral = specimen(
+        given, law=find_law("neo_hookean"), parameters=(Parameter("mu", "kPa", 1.0, 10.0),),
+        constants={"lam": 10.0},
+    )  # fmt: skip
+    observe, data, _ = read_measurements(neutral, table)
+    if list(observe.parts) != [Stress.name]:
+        raise InputError(f"data file {table} has {', '.join(observe.parts)} besides stresses")
+    largest = np.nanmax(np.abs(data[Stress.name]), axis=1, initial=0.0)
+    motion = np.abs(given.gradients).max(axis=(1, 2))
+    if not largest.max() > 0.0:
+        raise InputError(f"data file {table}: all stresses are zero")
+    moved = motion > 0.1 * motion.max()
+    return float(largest.max()), float((largest[moved] / motion[moved]).max())
+
+
+def _scene_text(law: Law, table: str, axes: list[str], slope: float) -> str:
+    """Return the scene file. Fibres are along the first axis that is pulled, sheets across it."""
+    lines = [f'law = "{law.name}"   # see docs/laws.md for others', f'specimen = "{table}"']
+    if law.fibres:
+        first = axes[0] if axes else "x"
+        second = next(a for a in [*axes[1:], *AXES] if a != first)
+        unit = {a: [float(a == b) for b in AXES] for a in AXES}
+        lines += ["", "[fibres]", 'rule = "uniform"']
+        lines.append(f"direction = {unit[first]}   # CHANGE: the fibres, or their mean direction")
+        if law.sheets:
+            lines.append(f"sheets = {unit[second]}   # CHANGE: the second axis of the tissue")
+    for quantity in law.quantities:
+        if quantity.name != "kappa":
+            lines += ["", *_parameter(quantity, slope)]
+    if any(quantity.name == "kappa" for quantity in law.quantities):
+        lines += ["", "[constants]", f"kappa = {_KAPPA * slope:.2g}   # kPa"]
+    return "\n".join(lines) + "\n"
+
+
+def _parameter(quantity: Quantity, slope: float) -> list[str]:
+    low, high = (share * slope for share in _MODULI) if quantity.unit == "kPa" else _EXPONENTS
+    logarithmic = True
+    if np.isfinite(quantity.high) or quantity.low < 0.0:
+        logarithmic = False
+        low, high = max(quantity.low, -20.0), min(quantity.high, 20.0)
+        margin = 0.01 * (high - low)
+        low, high = low + margin, high - margin
+    return [
+        f"[parameters.{quantity.name}]",
+        f'unit = "{quantity.unit}"',
+        f"range = [{low:.2g}, {high:.3g}]   # CHANGE: what you think possible",
+        *(['scale = "log"'] if logarithmic else []),
+    ]
+
+
+def _experiment_text(scene: str, table: str, largest: float, notes: list[str]) -> str:
+    head = ["# A first experiment file; what was guessed:", *(f"# - {note}" for note in notes)]
+    sd = f"{_NOISE * largest:.2g}"
+    return "\n".join(
+        [
+            *head,
+            "",
+            f'scene = "{scene}"',
+            f'data = "{table}"',
+            'forward = "incompressible"',
+            "",
+            "[noise.stress]",
+            'kind = "correlated"',
+            f"length = {_LENGTH}   # of stretch, along a curve",
+            f"sd_scale = {sd}   # kPa, of the independent errors' sd",
+            f"spatial_sd_scale = {sd}   # kPa, of those that correlate",
+            "",
+        ]
+    )

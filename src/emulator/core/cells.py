@@ -1,0 +1,162 @@
+"""Tables as text cells: CSV in its dialects, and the sheets of a spreadsheet.
+
+A CSV file has one header line, and columns separated by commas, semicolons or tabs, whichever the
+header has; with the latter two, numbers may have decimal commas. Blanks around words, empty lines
+and lines that begin with ``#`` are ignored. In a spreadsheet (an extra, ``openpyxl``) the first row
+of a sheet is its header, and several sheets become one table with a column ``protocol``.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from emulator.core.errors import InputError
+
+TEXT = (".csv", ".tsv", ".txt")
+SPREADSHEETS = (".xlsx", ".xlsm")
+PROTOCOL, BRANCH = "protocol", "branch"
+"""Columns of the test that a row belongs to, and of whether it was loading."""
+UNLOADING = "unloading"
+"""The word in the column ``branch`` of rows that are left out."""
+MISSING = ("", "na", "n/a", "nan")
+
+
+class Cells(NamedTuple):
+    """A table as text.
+
+    path : the file.
+    words : the names of the columns.
+    rows : the text of each cell by column, by the row's number, from 1 after the header.
+    decimal_comma : whether numbers may have decimal commas.
+    """
+
+    path: Path
+    words: Sequence[str]
+    rows: Mapping[int, Mapping[str, str]]
+    decimal_comma: bool
+
+    def number(self, row: int, word: str, *, gaps: bool = False) -> float:
+        """Return the number in a row and column; NaN where it is missing and may be.
+
+        :class:`InputError` for text, and for an empty cell that may not be.
+        """
+        cell = self.rows[row][word]
+        if gaps and cell.lower() in MISSING:
+            return float("nan")
+        try:
+            return float(cell.replace(",", ".") if self.decimal_comma and "." not in cell else cell)
+        except ValueError as error:
+            fault = f"'{cell}', not a number" if cell else "empty"
+            raise InputError(
+                f"data file {self.path}: row {row}, column '{word}' is {fault}"
+            ) from error
+
+
+def read_cells(path: Path, *, unloading: bool = False) -> Cells:
+    """Return the table of a CSV file or a spreadsheet, rows of unloading only if asked for.
+
+    Raises
+    ------
+    InputError
+        A file that is none, two columns of one name, a row longer than the header, or no rows.
+    """
+    sheets = path.suffix.lower() in SPREADSHEETS
+    words, cells, decimal_comma = (_of_sheets if sheets else _of_text)(path)
+    if words and all(map(_is_number, words)):
+        first = (";" if decimal_comma else ",").join(words)[:40]
+        raise InputError(
+            f"data file {path}: its first line, '{first}', has no names "
+            "of columns; put them above it, e.g. node,ux,uy,uz"
+        )
+    for word in words:
+        if word and words.count(word) > 1:
+            raise InputError(f"data file {path}: column '{word}' is there twice")
+    rows: dict[int, dict[str, str]] = {}
+    for number, row in enumerate(cells, 1):
+        if any(row[len(words) :]):
+            hint = "" if decimal_comma else "; decimal commas need semicolons between columns"
+            raise InputError(
+                f"data file {path}: row {number} has {len(row)} values for {len(words)} "
+                f"columns{hint}"
+            )
+        if any(row) or len(row) > 1:
+            padded = row + [""] * (len(words) - len(row))
+            rows[number] = dict(zip(words, padded, strict=False))
+    if words and not rows:
+        raise InputError(f"data file {path}: names of columns, and no row below them")
+    if BRANCH in words and not unloading:
+        rows = {k: row for k, row in rows.items() if row[BRANCH].lower() != UNLOADING}
+    return Cells(path, words, rows, decimal_comma)
+
+
+Raw = tuple[list[str], list[list[str]], bool]
+"""Header, rows of cells, and whether numbers may have decimal commas."""
+
+
+def _of_text(path: Path) -> Raw:
+    lines = _lines(path)
+    header = re.sub(r'"[^"]*"', "", lines[0]) if lines else ""  # quoted text does not count
+    delimiter = next((mark for mark in ";\t" if mark in header), ",")
+    try:
+        table = csv.reader(io.StringIO("\n".join(lines)), delimiter=delimiter, strict=True)
+        words, *cells = [[cell.strip() for cell in row] for row in table] or [[]]
+    except csv.Error as error:
+        raise InputError(f"data file {path} is not a CSV file: {error}") from error
+    return words, cells, delimiter != ","
+
+
+def _lines(path: Path) -> list[str]:
+    """Return the lines that are neither empty nor comments, the header first."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"data file {path} is not UTF-8 text; save it as CSV UTF-8") from error
+    if "\0" in text:
+        raise InputError(f"data file {path} is not a CSV file: it holds bytes that are no text")
+    lines = [line.strip(" \r") for line in text.split("\n")]
+    return [line for line in lines if line.strip() and not line.startswith("#")]
+
+
+def _of_sheets(path: Path) -> Raw:
+    try:
+        from openpyxl import load_workbook
+    except ImportError as error:
+        raise InputError(
+            f"data file {path} is a spreadsheet: save it as CSV, or install openpyxl "
+            "(soft-tissue-calibrate[sheets])"
+        ) from error
+    try:
+        book = load_workbook(path, read_only=True, data_only=True)
+        sheets = {sheet.title: list(_texts(sheet.iter_rows(values_only=True))) for sheet in book}
+    except Exception as error:  # openpyxl raises what its parsers do
+        raise InputError(f"data file {path} is not a readable spreadsheet: {error}") from error
+    sheets = {title: rows for title, rows in sheets.items() if len(rows) > 1}
+    words = list(dict.fromkeys(word for rows in sheets.values() for word in rows[0] if word))
+    own = len(sheets) > 1 and PROTOCOL not in words
+    cells = []
+    for title, (header, *rows) in sheets.items():
+        for row in rows:
+            by_word = dict(zip(header, row, strict=False))
+            cells.append([by_word.get(word, "") for word in words] + [title] * own)
+    return words + [PROTOCOL] * own, cells, False
+
+
+def _texts(rows: Iterator[tuple[Any, ...]]) -> Iterator[list[str]]:
+    """Yield the cells of each row that is not empty, as text."""
+    for row in rows:
+        texts = ["" if cell is None else str(cell).strip() for cell in row]
+        if any(texts):
+            yield texts
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word.replace(",", "."))
+    except ValueError:
+        return False
+    return True

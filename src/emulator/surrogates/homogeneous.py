@@ -1,0 +1,283 @@
+r"""Specimens without a mesh: the equilibrium of every homogeneous state by itself.
+
+Free stretches d minimise the energy density, compressible or not,
+
+.. math:: \min_d W(H(d)) \qquad\text{or}\qquad \min_d W(H(d)) \;\text{ with }\; \det F(d) = 1 ,
+
+by Newton's method from the stretches that keep the volume. Its steps go down the energy and keep
+every stretch above a fifth of its value. An incompressible specimen needs no pressure: the last
+free stretch follows from the others,
+
+.. math:: F_{ll} = (1 - \det F|_{F_{ll} = 0}) / \operatorname{cof}(F)_{ll} ,
+
+which is the condition that nothing pulls along it. First derivatives are those of the equilibrium,
+by the implicit function theorem. All states are one batch, and so are all theta
+under ``vmap``. FEM of the same scene gives the same numbers for a compressible law; for an
+incompressible map it tells what the law's bulk modulus changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emulator.core.errors import InputError
+from emulator.fem.energy import point_energy
+from emulator.fem.material_point import stress_and_moduli
+from emulator.mechanics.kinematics import cofactor, determinant
+from emulator.scenes.scene import Scene, all_nodes, check_nodes
+from emulator.scenes.specimen import States, states_of
+from emulator.surrogates.protocol import ForwardKind, Prediction, fingerprint_of
+
+_ITERATIONS = 300  # an exponent falls by about 1 in each, far away
+_CONVERGED = 1e-9  # step, of a stretch; the next one would be its square
+_ARMIJO = 1e-4
+_LEAST = 0.2  # share of a stretch that a step leaves
+_SHORT = 1e-6  # steps that round-off in the energy may not refuse
+_FLAT = 1e-10  # least pivot, relative to the stiffness
+
+
+@dataclass(frozen=True, eq=False)
+class Homogeneous:
+    """The states of a specimen as a forward map.
+
+    scene, nodes : the specimen's scene, and the nodes (k,) whose displacement is returned.
+    incompressible : whether no state changes its volume, whatever the law's bulk modulus.
+
+    Raises
+    ------
+    InputError
+        A scene that is no specimen or has loads; an incompressible state without a free direction.
+    """
+
+    scene: Scene
+    nodes: np.ndarray
+    incompressible: bool = False
+
+    def __post_init__(self) -> None:
+        if self.scene.loads:
+            raise InputError(f"scene '{self.scene.name}': a specimen has no loads")
+        closed = np.flatnonzero(~self.states.free.any(axis=1))
+        if self.incompressible and len(closed):
+            raise InputError(
+                f"state {closed[0] + 1} of '{self.scene.name}' has no free direction: an "
+                "incompressible specimen needs one in each state"
+            )
+
+    @cached_property
+    def states(self) -> States:
+        """The states of the specimen, in the order of its elements."""
+        return states_of(self.scene)
+
+    @property
+    def kind(self) -> str:
+        """The name of the kind of map."""
+        return "incompressible" if self.incompressible else "homogeneous"
+
+    @property
+    def label(self) -> str:
+        """The name of the map in pictures and tables."""
+        return f"{self.kind} specimen"
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Short hash of the kind, the scene and the nodes."""
+        return fingerprint_of(self.kind, self.scene.fingerprint, self.nodes)
+
+    def __call__(self, theta: jax.Array) -> jax.Array:
+        """Return the displacement (k, 3) mm at ``theta`` (p,)."""
+        return self.evaluate(theta).displacement
+
+    def evaluate(self, theta: jax.Array) -> Prediction:
+        """Return the displacement (k, 3) mm, and whether all states are in equilibrium."""
+        elements, rows, corners = self._places
+        point = Point(point_energy(self.scene, theta), stress_and_moduli(self.scene, theta))
+        tissue = jax.tree.map(lambda each: each[elements, 0], self.scene.tissue_at(theta))
+        settled, converged = jax.vmap(partial(equilibrium, point))(
+            jnp.asarray(self.states.gradients[elements]), *self._free(elements), tissue
+        )
+        columns = jnp.swapaxes(settled, 1, 2)[rows, np.maximum(corners - 1, 0)]
+        u = jnp.where((corners > 0)[:, None], columns, 0.0)
+        return Prediction(u, jnp.all(converged))
+
+    def _free(self, elements: np.ndarray) -> tuple[jax.Array, jax.Array]:
+        """Return the axes (e, u) of the free stretches, 3 for none, and that of the last, (e,).
+
+        The last one follows from the others where the specimen is incompressible, else it is 3.
+        """
+        axes = np.sort(np.where(self.states.free[elements], np.arange(3), 3), axis=1)
+        count = (axes < 3).sum(axis=1)
+        last = np.full(len(elements), 3)
+        if self.incompressible:
+            last = axes[np.arange(len(elements)), count - 1]
+            axes[np.arange(len(elements)), count - 1] = 3
+            count = count - 1
+        return jnp.asarray(axes[:, : count.max(initial=0)]), jnp.asarray(last)
+
+    @cached_property
+    def _places(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the elements (e,) of the nodes, and each node's row (k,) there and corner (k,)."""
+        flat = self.scene.mesh.elements.ravel()
+        position = np.argsort(flat)[self.nodes]  # each node is in one element
+        elements, rows = np.unique(position // 4, return_inverse=True)
+        return elements, rows, position % 4
+
+    def at(self, nodes: np.ndarray) -> Homogeneous:
+        """Return the map restricted to ``nodes``: only their states are computed."""
+        return replace(self, nodes=check_nodes(self.scene, nodes))
+
+
+class Point(NamedTuple):
+    """The law at one point, as functions of displacement gradient (3, 3) and tissue.
+
+    energy : the energy density in kPa.
+    moduli : stress dW/dH (3, 3) and moduli d2W/dH2 (3, 3, 3, 3), both in kPa.
+    """
+
+    energy: Callable[..., jax.Array]
+    moduli: Callable[..., tuple[jax.Array, jax.Array]]
+
+
+def equilibrium(
+    point: Point, H: jax.Array, axes: jax.Array, last: jax.Array, tissue: Any
+) -> tuple[jax.Array, jax.Array]:
+    """Return the displacement gradient (3, 3) of one state, and whether it is an equilibrium.
+
+    Parameters
+    ----------
+    H : the prescribed gradient (3, 3), zero in free directions.
+    axes : the axes (u,) of the stretches that minimise the energy; 3 for none.
+    last : the axis of the stretch that keeps the volume; 3 for none.
+    """
+    own, closes = axes < 3, jnp.arange(3) == last
+
+    def gradient(d: jax.Array) -> jax.Array:
+        stretched = H.at[axes, axes].set(d, mode="drop")
+        F = stretched + jnp.diag(jnp.where(closes, 0.0, 1.0))  # its last stretch is zero
+        along = jnp.where(closes, jnp.diagonal(cofactor(F)), 1.0)
+        closing = (1.0 - determinant(F)) / along - 1.0
+        return stretched + jnp.diag(jnp.where(closes, closing, 0.0))
+
+    free = closes.at[axes].set(True, mode="drop")
+    held = jnp.prod(jnp.where(free, 1.0, 1.0 + jnp.diagonal(H)))
+    start = jnp.where(own, held ** (-1.0 / jnp.maximum(jnp.sum(free), 1)) - 1.0, 0.0)
+    if not len(start):
+        return gradient(start), jnp.array(True)
+    slope_of = jax.jacfwd(gradient)  # (3, 3, u)
+
+    def linearised(d: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Return energy, slope (u,) and stiffness (u, u) in the own stretches."""
+        stress, moduli = point.moduli(gradient(d), tissue)
+        along, bending = slope_of(d), jax.jacfwd(slope_of)(d)
+        stiffness = jnp.einsum("ija,ijkl,klb->ab", along, moduli, along)
+        stiffness += jnp.einsum("ij,ijab->ab", stress, bending)
+        stiffness = jnp.where(own[:, None] & own, stiffness, jnp.diag(jnp.where(own, 0.0, 1.0)))
+        slope = jnp.where(own, jnp.einsum("ij,ija->a", stress, along), 0.0)
+        return point.energy(gradient(d), tissue), slope, stiffness
+
+    found = jax.lax.stop_gradient(_minimised(linearised, start))
+    # One more step, whose stiffness is a constant, has the derivative of the equilibrium.
+    stress = jax.grad(point.energy)(gradient(found.d), tissue)
+    slope = jnp.where(own, jnp.einsum("ij,ija->a", stress, slope_of(found.d)), 0.0)
+    step = _solved(found.stiffness, slope)
+    converged = found.converged & jnp.all(jnp.isfinite(step))
+    return gradient(found.d - jnp.where(converged, step, 0.0)), converged
+
+
+class Minimum(NamedTuple):
+    """A minimum at d (u,) with its stiffness (u, u), and whether it was found."""
+
+    d: jax.Array
+    stiffness: jax.Array
+    converged: jax.Array
+
+
+class _Descent(NamedTuple):
+    """Stretches d (u,) less 1 on the way from ``base``, whose step (u,) is taken by ``fraction``.
+
+    stiffness : the stiffness (u, u) at the base in kPa.
+    energy, decrease : the energy at the base in kPa, and its rate along the step.
+    evaluations : the number of evaluations.
+    """
+
+    d: jax.Array
+    base: jax.Array
+    step: jax.Array
+    stiffness: jax.Array
+    fraction: jax.Array
+    energy: jax.Array
+    decrease: jax.Array
+    evaluations: jax.Array
+
+
+def _minimised(linearised: Callable, start: jax.Array) -> Minimum:
+    """Return the minimum of the energy that ``linearised`` gives with slope and stiffness."""
+
+    def descend(at: _Descent) -> _Descent:
+        energy, slope, stiffness = linearised(at.d)
+        lower = energy <= at.energy + _ARMIJO * at.fraction * at.decrease
+        good = jnp.isfinite(energy) & (lower | (jnp.max(jnp.abs(at.step)) < _SHORT))
+        step = -_solved(stiffness, slope)
+        most = (1.0 - _LEAST) * (1.0 + at.d) / jnp.where(step < 0.0, -step, jnp.inf)
+        fraction = jnp.minimum(1.0, jnp.min(jnp.where(step < 0.0, most, 1.0)))
+        decrease = jnp.vdot(slope, step)
+        next_d = at.d + fraction * step
+        there = _Descent(next_d, at.d, step, stiffness, fraction, energy, decrease, at.evaluations)
+        half = 0.5 * at.fraction
+        back = at._replace(d=at.base + half * at.step, fraction=half)
+        chosen = jax.tree.map(lambda yes, no: jnp.where(good, yes, no), there, back)
+        return chosen._replace(evaluations=at.evaluations + 1)
+
+    def unfinished(at: _Descent) -> jax.Array:
+        return (jnp.max(jnp.abs(at.step)) > _CONVERGED) & (at.evaluations < _ITERATIONS)
+
+    none, inf = jnp.zeros(()), jnp.array(jnp.inf)
+    size = len(start)
+    begin = _Descent(
+        start, start, jnp.full(size, jnp.inf), jnp.eye(size), none, inf, none, jnp.array(0)
+    )
+    end = jax.lax.while_loop(unfinished, descend, begin)
+    found = (jnp.max(jnp.abs(end.step)) <= _CONVERGED) & jnp.all(jnp.isfinite(end.d))
+    stiffness = jnp.where(found, end.stiffness, jnp.eye(size))
+    return Minimum(jnp.where(found, end.d, start), stiffness, found)
+
+
+def _solved(K: jax.Array, rhs: jax.Array) -> jax.Array:
+    """Return K^-1 rhs of a symmetric (u, u) matrix, u at most 3, its pivots made positive.
+
+    Elimination is written out: batches of small systems can hang in LAPACK.
+    """
+    least, count = _FLAT * jnp.max(jnp.abs(K)), len(rhs)
+    rows, y, pivots = list(K), list(rhs), list[jax.Array]()
+    for k in range(count):
+        pivots.append(jnp.maximum(jnp.abs(rows[k][k]), least))
+        for below in range(k + 1, count):
+            factor = rows[below][k] / pivots[k]
+            rows[below], y[below] = rows[below] - factor * rows[k], y[below] - factor * y[k]
+    for k in reversed(range(count)):
+        known = sum((rows[k][j] * y[j] for j in range(k + 1, count)), jnp.zeros(()))
+        y[k] = (y[k] - known) / pivots[k]
+    return jnp.stack(y)
+
+
+def homogeneous(scene: Scene, *, incompressible: bool = False) -> Homogeneous:
+    """Return the states of the specimen ``scene`` as a forward map, see :class:`Homogeneous`."""
+    return Homogeneous(scene, all_nodes(scene), incompressible)
+
+
+HOMOGENEOUS = ForwardKind(
+    "homogeneous",
+    "states of a specimen, without a mesh",
+    lambda ingredients, _: homogeneous(ingredients.scene),
+)
+INCOMPRESSIBLE = ForwardKind(
+    "incompressible",
+    "the same, without changes of volume",
+    lambda ingredients, _: homogeneous(ingredients.scene, incompressible=True),
+)

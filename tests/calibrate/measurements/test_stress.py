@@ -1,0 +1,157 @@
+"""Stresses of specimens: closed forms, measures, units, and tables that are wrong."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import emulator as em
+from calibrate.measurements import Stress, observations_from_json, parse_observation
+from calibrate.measurements.collection import observations
+from calibrate.measurements.data import read_measurements, write_data
+from emulator.core.errors import InputError
+from emulator.scenes.scene import all_nodes
+from emulator.scenes.specimen import specimen
+from emulator.surrogates.homogeneous import Homogeneous
+
+S = np.linspace(1.0, 1.4, 5)
+MU = 7.0
+
+
+def neo_hookean(columns):
+    return specimen(
+        columns,
+        law=em.find_law("neo_hookean_split"),
+        parameters=(em.Parameter("mu", "kPa", 1.0, 20.0),),
+        constants={"kappa": 100.0},
+    )
+
+
+def predicted(scene, components):
+    part, theta = Stress.of(scene, components), jnp.array([MU])
+    u = Homogeneous(scene, all_nodes(scene), incompressible=True)(theta)
+    return np.asarray(part(u, theta))
+
+
+def test_incompressible_neo_hooke_in_closed_form():
+    # The Cauchy stress less pressure is mu b; along one axis mu (s^2 - 1/s), along two
+    # mu (s^2 - s^-4); sheared by g, mu g across and mu g^2 along, where z is free of stress.
+    one = predicted(neo_hookean({"stretch_x": S}), "cauchy_x,stress_x,second_x,cauchy_y")
+    cauchy = MU * (S**2 - 1.0 / S)
+    expected = np.stack([cauchy, cauchy / S, cauchy / S**2, 0.0 * S], axis=1)
+    np.testing.assert_allclose(one, expected, atol=1e-12)
+    two = predicted(neo_hookean({"stretch_x": S, "stretch_y": S}), "cauchy_x,cauchy_y")
+    np.testing.assert_allclose(two, MU * (S**2 - S**-4.0)[:, None] * np.ones(2), atol=1e-12)
+    held = predicted(neo_hookean({"stretch_x": S, "stretch_y": 0.0 * S + 1.0}), "cauchy_x,cauchy_y")
+    planar = np.stack([MU * (S**2 - S**-2.0), MU * (1.0 - S**-2.0)], axis=1)
+    np.testing.assert_allclose(held, planar, atol=1e-12)
+    g, rest = np.linspace(0.0, 0.6, 4), np.ones(4)
+    sheared = neo_hookean({"shear_xy": g, "stretch_x": rest, "stretch_y": rest})
+    components = "cauchy_xy,cauchy_x,cauchy_y,stress_xy"
+    expected = np.stack([MU * g, MU * g**2, 0.0 * g, MU * g], axis=1)
+    np.testing.assert_allclose(predicted(sheared, components), expected, atol=1e-12)
+
+
+def test_all_six_shears_of_fibres_have_their_stress():
+    """The energy's own derivative along each shear, of a law whose six shears differ."""
+    amounts = np.array([0.1, 0.3])
+    for i, j in ((0, 1), (1, 0), (0, 2), (2, 0), (1, 2), (2, 1)):
+        plane = "xyz"[i] + "xyz"[j]
+        free = ({0, 1, 2} - {i, j}).pop()
+        held = {f"stretch_{a}": np.ones(2) for k, a in enumerate("xyz") if k != free}
+        scene = specimen(
+            {**held, f"shear_{plane}": amounts},
+            law=em.find_law("holzapfel_ogden_orthotropic"),
+            parameters=(em.Parameter("a", "kPa", 0.1, 2.0),),
+            constants={
+                "b": 7.0, "a_f": 15.0, "b_f": 15.0, "a_s": 2.0, "b_s": 10.0, "a_fs": 0.4,
+                "b_fs": 9.0, "kappa": 50.0,
+            },
+            fibres=[1.0, 0.0, 0.0], sheets=[0.0, 1.0, 0.0],
+        )  # fmt: skip
+        theta = jnp.array([0.5])
+        u = Homogeneous(scene, all_nodes(scene), incompressible=True)(theta)
+        shear = np.asarray(Stress.of(scene, f"stress_{plane}")(u, theta))[:, 0]
+        step = 1e-6
+        energies = []
+        for sign in (-1.0, 1.0):
+            moved = np.array(u)
+            moved[scene.mesh.elements[:, 1 + j], i] += sign * step
+            energies.append(np.array(list(density(scene, moved, theta))))
+        np.testing.assert_allclose(shear, (energies[1] - energies[0]) / (2.0 * step), rtol=1e-6)
+
+
+def density(scene, u, theta):
+    """Yield the energy density of each state, from the potential of its scene alone."""
+    whole = em.strain_energy(scene)
+    volume = scene.discretisation.weights.sum()
+    for k in range(len(scene.mesh.elements)):
+        alone = np.zeros_like(u)
+        nodes = scene.mesh.elements[k]
+        alone[nodes] = u[nodes]
+        yield float(whole(jnp.asarray(alone), theta)) / volume * len(scene.mesh.elements)
+
+
+def test_a_table_is_read_in_its_units(tmp_path):
+    path = tmp_path / "table.csv"
+    path.write_text(
+        "strain_x [%];force_x [N];area_x [cm2];cauchy_y [MPa]\n0;0;0,2;0\n10;0,5;0,2;0,01\n"
+        "20;1,5;0,2;NA\n"
+    )
+    scene = neo_hookean({"strain_x": np.array([0.0, 0.1, 0.2])})
+    observe, data, _ = read_measurements(scene, path)
+    (part,) = observe.parts.values()
+    assert part.components == ("stress_x", "cauchy_y")
+    expected = [[0.0, 0.0], [25.0, 10.0], [75.0, np.nan]]
+    np.testing.assert_allclose(data["stress"], expected)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("stretch_x,stress_x\n1,0\n1.2,1\n", "2 rows say how the specimen moves"),
+        ("stretch_x,stress_x\n1,0\n1.1,1\n1.3,2\n", "row 3 moves otherwise"),
+        ("stretch_x,stress_x\n1,0\n1.1,-1\n1.2,-3\n", "pulls against the motion"),
+        ("stretch_x,stress_x [psi]\n1,0\n1.1,1\n1.2,2\n", "unit 'psi' is unknown"),
+        ("stretch_x,force_x\n1,0\n1.1,1\n1.2,2\n", "give the area at rest"),
+        ("stretch_x\n1\n1.1\n1.2\n", "column 'stress_x' is missing"),
+        ("stress_x\n1\n1.1\n1.2\n", "column 'stretch_x' is missing"),
+        ("stretch_x,stress_x\n1,0\n1.1,inf\n1.2,2\n", "has an infinite value"),
+        ("stretch_x,stress_x\n1,0\n1.1,x\n1.2,2\n", "row 2, column 'stress_x' is 'x'"),
+        ("stretch_x,stress_x\n1,\n1.1,\n1.2,\n", "every value of stress is missing"),
+    ],
+)
+def test_wrong_tables_are_refused_in_one_line(tmp_path, text, message):
+    path = tmp_path / "table.csv"
+    path.write_text(text)
+    scene = neo_hookean({"stretch_x": np.array([1.0, 1.1, 1.2])})
+    with pytest.raises(InputError) as caught:
+        read_measurements(scene, path)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_written_and_read_again(tmp_path):
+    columns = {"stretch_x": S, "stretch_y": np.array([1.0, 1.05, np.nan, np.nan, 1.1])}
+    scene = neo_hookean(columns | {"shear_xz": np.linspace(0.0, 0.2, 5)})
+    observe = observations(Stress.of(scene, "stress_x,cauchy_xz"))
+    values = np.arange(10.0).reshape(5, 2)
+    for name in ("data.csv", "data.nc"):
+        write_data(tmp_path / name, observe, values)
+        found, data, _ = read_measurements(scene, tmp_path / name)
+        assert found.to_json() == observe.to_json()
+        np.testing.assert_array_equal(data["stress"], values)
+    again = observations_from_json(scene, observe.to_json())
+    assert again.parts["stress"].components == ("stress_x", "cauchy_xz")
+    assert parse_observation(scene, "stress:stress_x").shapes == {"stress": (5, 1)}
+    with pytest.raises(InputError, match="stress 'pull_x' is unknown"):
+        parse_observation(scene, "stress:pull_x")
+
+
+def test_errors_correlate_along_a_curve_and_not_between_tests():
+    from emulator.scenes.specimen import states
+
+    given = states({"stretch_x": np.array([1.0, 1.1, 1.0, 1.3])}, ["a", "a", "b", "b"])
+    sites = Stress.of(neo_hookean(given), "stress_x,stress_y").sites
+    np.testing.assert_allclose(sites.positions[::2, 0], [0.0, 0.1, 0.0, 0.3])
+    assert len(np.unique(sites.positions[:, 1])) == 2
+    np.testing.assert_array_equal(sites.component, [0, 1] * 4)

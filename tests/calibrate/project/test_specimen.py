@@ -1,0 +1,92 @@
+"""From a test's table to a posterior with FEM's verdict, by the commands a user types."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from calibrate.project.experiment import read_experiment
+from calibrate.project.specimen import draft_specimen
+from emulator.core.errors import InputError
+
+A, B = 8.0, 6.0  # W = a (exp(b (I1 - 3)) - 1) / 2 b
+
+
+def table(noise=0.0, seed=0):
+    """Two biaxial tests of an isotropic exponential, incompressible, in closed form."""
+    rows = ["protocol,branch,stretch_x,stretch_y,stress_x [kPa],stress_y [kPa]"]
+    rng = np.random.default_rng(seed)
+    for name, ratio in (("equal", 1.0), ("half", 0.5)):
+        for strain in np.linspace(0.0, 0.2, 9):
+            s, r = 1.0 + strain, 1.0 + ratio * strain
+            z = 1.0 / (s * r)
+            factor = A * np.exp(B * (s**2 + r**2 + z**2 - 3.0))
+            P = factor * np.array([s - z**2 / s, r - z**2 / r]) + noise * rng.normal(size=2)
+            rows.append(f"{name},loading,{s:.12g},{r:.12g},{P[0]:.12g},{P[1]:.12g}")
+        rows.append(f"{name},unloading,1.1,{1.0 + 0.5 * ratio * 0.2:.12g},0.5,0.5")
+    return "\n".join(rows) + "\n"
+
+
+def test_files_are_written_and_say_what_was_guessed(tmp_path):
+    (tmp_path / "test.csv").write_text(table())
+    draft = draft_specimen(tmp_path / "test.csv", tmp_path / "test.toml")
+    assert draft.scene.law.name == "holzapfel_gasser_ogden"
+    notes = " ".join(draft.notes)
+    for words in ("18 states in 2 tests (equal, half)", "2 rows of unloading are left out", "kPa"):
+        assert words in notes
+    problem = read_experiment(draft.path)
+    assert problem.data["stress"].shape == (18, 2)
+    assert problem.run.forward == "incompressible"
+    with pytest.raises(InputError, match="is there already"):
+        draft_specimen(tmp_path / "test.csv", tmp_path / "test.toml")
+
+
+@pytest.mark.parametrize(
+    ("law", "lacks"), [("may_newman", "sheets"), ("ogden_1", "fibres"), ("fung_planar", None)]
+)
+def test_any_law_is_drafted(tmp_path, law, lacks):
+    (tmp_path / "test.csv").write_text(table())
+    draft = draft_specimen(tmp_path / "test.csv", tmp_path / "test.toml", law=law)
+    assert lacks is None or lacks not in draft.scene_path.read_text()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("stretch_x\n1.0\n1.1\n", "column 'stress_x' is missing"),
+        ("stretch_x,stress_x\n1.0,0\n1.1,0\n", "all stresses are zero"),
+        ("x,y\n1.0,0\n", "no column says how the specimen moves"),
+        ("stretch_x,stress_x\n1.0,0\n1.1,1\n1.0,0\n1.2,2\n", "another test under another name"),
+    ],
+)
+def test_wrong_tables_leave_no_files(tmp_path, text, message):
+    (tmp_path / "test.csv").write_text(text)
+    with pytest.raises(InputError) as caught:
+        draft_specimen(tmp_path / "test.csv", tmp_path / "test.toml")
+    assert message in str(caught.value)
+    assert not list(tmp_path.glob("*.toml"))
+
+
+@pytest.mark.slow
+def test_from_a_table_to_a_verdict(tmp_path):
+    (tmp_path / "test.csv").write_text(table(noise=0.3))
+
+    def calibrate(*words):
+        call = "import sys; from calibrate.cli import main; sys.exit(main(sys.argv[1:]))"
+        done = subprocess.run(
+            [sys.executable, "-c", call, *words], capture_output=True, text=True, cwd=tmp_path,
+            check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    calibrate("init", "test.csv", "--law", "holzapfel_ogden_isotropic")
+    result = json.loads(calibrate("infer", "test.toml", "--out", "run", "--json"))
+    assert result["verdict"] == "accepted"
+    rows = result["posterior"]
+    for name, truth in (("a", A), ("b", B)):
+        assert abs(rows[name]["mean"] - truth) < 3.0 * rows[name]["sd"]
+    calibrate("report", "run")
+    assert (tmp_path / "run" / "report.html").is_file()

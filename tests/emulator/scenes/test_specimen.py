@@ -1,0 +1,148 @@
+"""Tables of a specimen's states: what they mean, and what they cannot mean."""
+
+import numpy as np
+import pytest
+
+import emulator as em
+from emulator.core.errors import InputError
+from emulator.scenes.file import read_scene
+from emulator.scenes.specimen import read_states, specimen, states, states_of, with_unit
+
+NAN = np.nan
+
+
+def test_columns_are_components_of_the_gradient():
+    given = states(
+        {
+            "stretch_x": np.array([1.1, 1.2]),
+            "green_y": np.array([0.105, NAN]),
+            "shear_xz [%]": np.array([0.0, 5.0]),
+        }
+    )
+    np.testing.assert_allclose(given.gradients[0], np.diag([0.1, 0.1, 0.0]), atol=1e-12)
+    expected = np.array([[0.2, 0.0, 0.05], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    np.testing.assert_allclose(given.gradients[1], expected, atol=1e-12)
+    np.testing.assert_array_equal(given.free, [[False, False, True], [False, True, True]])
+    same = states({"strain_x [%]": np.array([10.0])}).gradients
+    np.testing.assert_allclose(same, states({"strain_x": np.array([0.1])}).gradients)
+
+
+@pytest.mark.parametrize(
+    ("word", "expected"),
+    [
+        ("stress_x", ("stress_x", "")),
+        ("stress_x [MPa]", ("stress_x", "MPa")),
+        ("force_x (N)", ("force_x", "N")),
+        (" strain_x[%] ", ("strain_x", "%")),
+        ("protocol", ("protocol", "")),
+    ],
+)
+def test_columns_have_units(word, expected):
+    assert with_unit(word) == expected
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({}, "no column says how the specimen moves"),
+        ({"stretch_x": [1.0, 1.1], "strain_x": [0.0, 0.1]}, "says the same as 'stretch_x'"),
+        ({"stretch_x": [100.0, 110.0]}, "a stretch is 1 at rest"),
+        ({"strain_x": [0.0, 12.0]}, "call it 'strain_x [%]'"),
+        ({"shear_xy": [0.0, 10.0]}, "row 2, column 'shear_xy' is a shear of 10"),
+        ({"shear_xx": [0.0, 0.1]}, "says the same as 'a stretch'"),
+        ({"stretch_x [mm]": [1.0, 1.1]}, "unit 'mm'"),
+        ({"stretch_x [%]": [1.0, 1.1]}, "unit '%'"),
+        ({"green_x": [-0.7]}, "goes down to -0.7"),
+        ({"stretch_x": [1.0, NAN]}, "row 2 has no stretch and no shear"),
+        ({"stretch_x": [1.0, 1.2, 1.1]}, "row 3 is nearer to rest than the one before: unloading"),
+    ],
+)
+def test_tables_that_no_specimen_makes_are_refused(columns, message):
+    with pytest.raises(InputError, match=None) as caught:
+        states({name: np.array(values) for name, values in columns.items()})
+    assert message in str(caught.value)
+
+
+def test_tests_have_names_and_each_leads_away_from_rest():
+    path = np.array([1.0, 1.1, 1.0, 1.2])
+    given = states({"stretch_x": path}, ["a", "a", "b", "b"])
+    assert {name: rows.tolist() for name, rows in given.protocols.items()} == {
+        "a": [0, 1],
+        "b": [2, 3],
+    }
+    with pytest.raises(InputError, match="row 3 is nearer"):
+        states({"stretch_x": path})
+
+
+def of_law(given, **entries):
+    return specimen(
+        given,
+        law=em.find_law("neo_hookean"),
+        parameters=(em.Parameter("mu", "kPa", 5.0, 20.0),),
+        constants={"lam": 50.0},
+        **entries,
+    )
+
+
+def test_a_scene_has_the_states_that_made_it():
+    columns = {"stretch_x": np.array([1.1, NAN, 1.3]), "shear_yz": np.array([0.0, 0.2, 0.1])}
+    given = states(columns, ["pull", "shear", "both"])
+    again = states_of(of_law(given))
+    np.testing.assert_array_equal(again.gradients, given.gradients)
+    np.testing.assert_array_equal(again.free, given.free)
+    assert {n: r.tolist() for n, r in again.protocols.items()} == {
+        "pull": [0],
+        "shear": [1],
+        "both": [2],
+    }
+    with pytest.raises(InputError, match="is no specimen"):
+        states_of(em.find_scene("twisting_cube"))
+
+
+SCENE = """
+law = "neo_hookean"
+specimen = "table.csv"
+[parameters.mu]
+unit = "kPa"
+range = [1.0, 10.0]
+[constants]
+lam = 10.0
+"""
+
+
+def test_a_scene_file_names_the_table(tmp_path):
+    (tmp_path / "table.csv").write_text(
+        "protocol,branch,stretch_x,stress_x\n"
+        "pull,loading,1.0,0\npull,loading,1.1,1\npull,unloading,1.0,0.5\n"
+    )
+    (tmp_path / "scene.toml").write_text(SCENE)
+    scene = read_scene(tmp_path / "scene.toml")
+    assert len(scene.mesh.elements) == 2
+    assert scene.mesh.node_set("pull").tolist() == list(range(8))
+    (tmp_path / "scene.toml").write_text(SCENE.replace("[parameters", "order = 2\n[parameters", 1))
+    with pytest.raises(InputError, match="line 4: a specimen has none"):
+        read_scene(tmp_path / "scene.toml")
+    (tmp_path / "table.csv").write_text("stretch_x,stress_x\n1.0,0\n112,1\n")
+    (tmp_path / "scene.toml").write_text(SCENE)
+    with pytest.raises(InputError, match=r"table.csv: row 2, column 'stretch_x' is a stretch"):
+        read_scene(tmp_path / "scene.toml")
+
+
+def test_sheets_are_tests(tmp_path):
+    openpyxl = pytest.importorskip("openpyxl", reason="spreadsheets are an extra")
+    book = openpyxl.Workbook()
+    for k, name in enumerate(("x alone", "y alone")):
+        sheet = book.active if k == 0 else book.create_sheet()
+        sheet.title = name
+        sheet.append([f"stretch_{'xy'[k]}", "stress_x"])
+        for stretch in (1.0, 1.1, 1.2):
+            sheet.append([stretch, 0.0])
+    book.create_sheet("notes")
+    book.save(tmp_path / "book.xlsx")
+    given = read_states(tmp_path / "book.xlsx")
+    assert {name: len(rows) for name, rows in given.protocols.items()} == {
+        "x alone": 3,
+        "y alone": 3,
+    }
+    np.testing.assert_array_equal(given.free[0], [False, True, True])
+    np.testing.assert_array_equal(given.free[5], [True, False, True])

@@ -1,0 +1,121 @@
+"""Specimens without a mesh against FEM of the same scene, closed forms and differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import emulator as em
+from emulator.core.errors import InputError
+from emulator.scenes.scene import all_nodes
+from emulator.scenes.specimen import specimen, states
+from emulator.surrogates.homogeneous import Homogeneous
+
+NAN = np.nan
+PULL = np.linspace(1.0, 1.2, 4)
+GIVEN = states(
+    {
+        "stretch_x": np.concatenate([PULL, PULL, np.full(8, NAN)]),
+        "stretch_y": np.concatenate([np.full(4, NAN), 0.5 + 0.5 * PULL, np.full(8, NAN)]),
+        "shear_xz": np.concatenate([np.zeros(8), PULL - 0.99, np.zeros(4)]),
+        "shear_yx": np.concatenate([np.zeros(12), PULL - 0.99]),
+    },
+    ["uniaxial"] * 4 + ["biaxial"] * 4 + ["xz"] * 4 + ["yx"] * 4,
+)
+THETA = jnp.array([1.0, 6.0])
+
+
+@pytest.fixture(scope="module")
+def tissue():
+    """Fibres at 30 degrees from x in the plane of x and y."""
+    return specimen(
+        GIVEN,
+        law=em.find_law("holzapfel_ogden"),
+        parameters=(em.Parameter("a", "kPa", 0.2, 2.0), em.Parameter("b_f", "", 1.0, 10.0)),
+        constants={"b": 3.0, "a_f": 5.0, "kappa": 40.0},
+        fibres=[np.cos(np.pi / 6.0), 0.5, 0.0],
+    )
+
+
+@pytest.fixture(scope="module")
+def compressible(tissue):
+    return Homogeneous(tissue, all_nodes(tissue))
+
+
+def test_fem_has_the_same_states(tissue, compressible):
+    solution = em.Simulator(tissue).solve(THETA).require_converged("specimen")
+    predicted = compressible.evaluate(THETA)
+    assert bool(predicted.valid)
+    np.testing.assert_allclose(predicted.displacement, solution.displacement, atol=1e-9)
+
+
+@pytest.mark.parametrize("incompressible", [False, True])
+def test_derivatives_are_those_of_differences(tissue, incompressible):
+    forward, step = Homogeneous(tissue, all_nodes(tissue), incompressible), 1e-4
+    slopes = jax.jit(jax.jacfwd(forward))(THETA)
+    by_reverse = jax.jit(jax.grad(lambda theta: jnp.sum(forward(theta) ** 2)))
+    jitted = jax.jit(forward)
+    for k in range(2):
+        along = step * THETA[k] * jnp.eye(2)[k]
+        up, down = jitted(THETA + along), jitted(THETA - along)
+        difference = (up - down) / (2.0 * along[k])
+        np.testing.assert_allclose(slopes[..., k], difference, atol=1e-7)
+        square = (jnp.sum(up**2) - jnp.sum(down**2)) / (2.0 * along[k])
+        assert float(by_reverse(THETA)[k]) == pytest.approx(float(square), abs=1e-7)
+    assert np.abs(slopes).max() > 1e-3
+
+
+def test_an_incompressible_specimen_keeps_its_volume(tissue):
+    forward = Homogeneous(tissue, all_nodes(tissue), incompressible=True)
+    u = np.asarray(forward(THETA))
+    F = np.eye(3) + np.swapaxes(u[tissue.mesh.elements[:, 1:]], 1, 2)
+    np.testing.assert_allclose(np.linalg.det(F), 1.0, atol=1e-14)
+    # The limit of a law whose volume hardly changes.
+    stiff = specimen(
+        GIVEN, law=tissue.law, parameters=tissue.parameters, fibres=tissue.fibres,
+        constants={**tissue.constants, "kappa": 1e6},
+    )  # fmt: skip
+    np.testing.assert_allclose(Homogeneous(stiff, forward.nodes)(THETA), u, atol=1e-4)
+
+
+def test_many_theta_and_some_nodes(tissue, compressible):
+    thetas = jnp.stack([THETA, 1.5 * THETA, 0.3 * THETA])
+    batch = jax.jit(jax.vmap(compressible.evaluate))(thetas)
+    assert batch.valid.all()
+    for theta, u in zip(thetas, batch.displacement, strict=True):
+        np.testing.assert_allclose(compressible(theta), u, atol=1e-12)
+    nodes = np.array([50, 3, 17])
+    np.testing.assert_allclose(compressible.at(nodes)(THETA), batch.displacement[0, nodes])
+
+
+def test_hard_states_are_found_or_refused():
+    """Exponents by which W overflows on the way, and a box corner of a hundred times the data."""
+    pull = np.array([1.1, 1.6])
+    scene = specimen(
+        {"stretch_x": pull},
+        law=em.find_law("holzapfel_ogden"),
+        parameters=(em.Parameter("a", "kPa", 1e-4, 100.0), em.Parameter("b", "", 0.1, 80.0)),
+        constants={"a_f": 50.0, "b_f": 60.0, "kappa": 100.0},
+        fibres=[0.0, 1.0, 0.0],
+    )
+    forward = jax.jit(jax.vmap(Homogeneous(scene, all_nodes(scene)).evaluate))
+    corners = jnp.array([[a, b] for a in (1e-4, 100.0) for b in (0.1, 20.0, 80.0)])
+    found = forward(corners)
+    assert np.isfinite(found.displacement).all()
+    assert found.valid.all()
+    outside = forward(jnp.array([[jnp.nan, 1.0], [1.0, jnp.inf], [1.0, 1e4]]))
+    assert np.isfinite(outside.displacement).all()
+    assert not outside.valid[:2].any()
+
+
+def test_scenes_that_are_no_specimen_are_refused(tissue):
+    cube = em.find_scene("twisting_cube")
+    with pytest.raises(InputError, match="is no specimen"):
+        Homogeneous(cube, all_nodes(cube)).evaluate(cube.centre)
+    closed = specimen(
+        {"stretch_x": np.array([1.1]), "stretch_y": np.array([1.0]), "stretch_z": np.array([1.0])},
+        law=tissue.law, parameters=tissue.parameters, constants=tissue.constants,
+        fibres=tissue.fibres[0],
+    )  # fmt: skip
+    with pytest.raises(InputError, match="state 1 of 'specimen' has no free direction"):
+        Homogeneous(closed, all_nodes(closed), incompressible=True)
