@@ -21,6 +21,7 @@ from studies.samplers.problems import BODIES, OBSERVED, PROBLEMS, problem
 from studies.samplers.ways import Moments, effective, gradient_s, moments, reference, timed, ways
 
 from calibrate.figures import BLUE, GREEN, ORANGE, VERMILION, pyplot
+from emulator.core.errors import SolverError
 
 HERE = Path(__file__).parent
 SEED = 11
@@ -55,7 +56,11 @@ def examine(name: str, draws: int, points: int, without: Collection[str] = ()) -
     for way, draw in ways(model, data, draws).items():
         if way in without:
             continue
-        found[way], seconds = timed(draw, SEED)
+        try:
+            found[way], seconds = timed(draw, SEED)
+        except SolverError as failure:  # importance sampling says so, and `auto` takes NUTS
+            print(f"{name}, {way}: {failure}", file=sys.stderr, flush=True)
+            continue
         print(f"{name}, {way}: {seconds:.1f} s", file=sys.stderr, flush=True)
         rows[way] = {"ess": round(effective(found[way]), 1), "processor_s": round(seconds, 3)}
     exact = reference(model, data, found["nuts"].draws, points)
@@ -94,7 +99,8 @@ def table(cases: list[Case]) -> str:
         rates = ["" if np.isnan(value) else f"{value:.3g}" for value in values]
         best = int(np.nanargmax(values))
         rates[best] = f"**{rates[best]}**"
-        z = [max(case["samplers"][way]["z"].values()) for way in OURS]
+        rows = [case["samplers"].get(way) for way in OURS]
+        z = [max(row["z"].values()) if row else float("nan") for row in rows]
         lines.append(
             f"| {case['name']} | {case['unknowns']} | {1e3 * case['gradient_s']:.3f} ms | "
             f"{' | '.join(rates)} | {' | '.join(f'{value:.1f}' for value in z)} |"
@@ -122,7 +128,8 @@ def draw(cases: list[Case], path: Path) -> None:
 
 def check(cases: list[Case]) -> None:
     """Assert the README's claims."""
-    z = [value for case in cases for way in OURS for value in case["samplers"][way]["z"].values()]
+    rows = [case["samplers"][way] for case in cases for way in OURS if way in case["samplers"]]
+    z = [value for row in rows for value in row["z"].values()]
     assert max(z) < 4.0, max(z)
     assert np.mean(np.array(z) > 3.0) < 0.05
     for case in cases:

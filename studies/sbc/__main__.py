@@ -1,4 +1,4 @@
-"""Simulation-based calibration of the shipped emulators, their noise models and NUTS.
+"""Simulation-based calibration of forward maps, noise models and the default sampler.
 
 ``python -m studies.sbc [--replicates N] [--only NAME ...]``. FEM makes the data, the emulator's
 posterior is ranked. Writes results.json and a figure a case beside itself, or under --out, after
@@ -12,10 +12,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import numpyro.distributions as dist
 from studies.common.output import study_header
 
 import calibrate as cal
+import emulator as em
 from calibrate.analysis.sbc import Calibration, sbc
 from calibrate.figures.sensitivity import draw_calibration
 from calibrate.project import Run, by_fem, model_before_data
@@ -65,12 +67,34 @@ class Biased:
         return found._replace(displacement=1.02 * found.displacement)
 
 
+def specimen() -> Model:
+    """Three biaxial tests of a wall with two families of dispersed fibres, incompressible."""
+    strains = np.linspace(0.02, 0.2, 10)
+    stretches = np.concatenate([1.0 + np.outer(strains, r) for r in ((1, 1), (1, 0.5), (0.5, 1))])
+    scene = em.specimen(
+        {"stretch_x": stretches[:, 0], "stretch_y": stretches[:, 1]},
+        ordered=False,
+        law=em.find_law("gasser_ogden_holzapfel"),
+        parameters=(
+            em.Parameter("c", "kPa", 5.0, 50.0),
+            em.Parameter("k_1", "kPa", 5.0, 50.0),
+            em.Parameter("k_2", "", 1.0, 15.0),
+            em.Parameter("dispersion", "", 0.02, 0.3),
+        ),
+        constants={"angle": 35.0, "kappa": 1e4},
+        fibres=[1.0, 0.0, 0.0],
+        sheets=[0.0, 1.0, 0.0],
+    )
+    forward = em.homogeneous(scene, incompressible=True)
+    return cal.model(forward, cal.stresses(scene, "cauchy_x,cauchy_y"), cal.GaussianNoise(sd=2.0))
+
+
 @dataclass(frozen=True)
 class Case:
-    """A run, who makes its data, and whether the check should pass."""
+    """A run or a model, who makes its data, and whether the check should pass."""
 
     title: str
-    run: Run
+    run: Run | Callable[[], Model]
     truth: Callable[[Model], Model]
     passes: bool
 
@@ -78,6 +102,7 @@ class Case:
 CASES = {
     "beam": Case("beam", BEAM, by_fem, passes=True),
     "ventricle": Case("left ventricle", VENTRICLE, by_fem, passes=True),
+    "specimen": Case("biaxial specimen", specimen, lambda model: model, passes=True),
     "noise": Case("beam, 1.5 times the model's noise", BEAM, noisier, passes=False),
     "prior": Case("beam, lam from the upper half of its range", BEAM, stiffer, passes=False),
     "map": Case("beam, 2 % more displacement", BEAM, biased, passes=False),
@@ -87,7 +112,7 @@ CASES = {
 def examine(name: str, replicates: int, out: Path) -> dict[str, Any]:
     """Ranks of one case, with its figure."""
     case, began = CASES[name], time.process_time()
-    model = model_before_data(case.run)
+    model = model_before_data(case.run) if isinstance(case.run, Run) else case.run()
     options = AutoOptions(200, 250, 2, rounds=1)  # importance sampling, NUTS where that fails
     found: Calibration = sbc(model, replicates, truth=case.truth(model), options=options, seed=SEED)
     draw_calibration(found, case.title, out / f"{name}.png")
