@@ -121,11 +121,16 @@ class Stress(PointObservation):
         return np.where(given.free, np.nan, 1.0 + np.diagonal(given.gradients, axis1=1, axis2=2))
 
     @cached_property
-    def _paths(self) -> np.ndarray:
+    def tests(self) -> Mapping[str, np.ndarray]:
+        """The states (k,) of each test by its name; one without a name where none has any."""
+        return states_of(self.scene).protocols
+
+    @cached_property
+    def paths(self) -> np.ndarray:
         """The way of each state from the first of its test, in stretch, and the test's place."""
-        given, paths = states_of(self.scene), np.zeros((len(self.stretches), 3))
-        for number, rows in enumerate(given.protocols.values()):
-            steps = np.linalg.norm(np.diff(given.gradients[rows], axis=0), axis=(1, 2))
+        gradients, paths = states_of(self.scene).gradients, np.zeros((len(self.stretches), 3))
+        for number, rows in enumerate(self.tests.values()):
+            steps = np.linalg.norm(np.diff(gradients[rows], axis=0), axis=(1, 2))
             paths[rows, 0] = np.concatenate([[0.0], np.cumsum(steps)])
             paths[rows, 1] = _APART * number
         return paths
@@ -133,7 +138,7 @@ class Stress(PointObservation):
     @property
     def sites(self) -> Sites:
         """The way along each test in stretch, so that errors correlate along its curve."""
-        sites = Sites.of(self._paths, len(self.components))
+        sites = Sites.of(self.paths, len(self.components))
         return sites if self.entries is None else Sites(*(each[self.entries] for each in sites))
 
     def rows(self) -> tuple[str, np.ndarray]:

@@ -23,6 +23,7 @@ from calibrate.report import charts, parts, population
 from calibrate.report.body import body_figure
 from calibrate.report.parts import Verdict
 from emulator.core.store import read_json, replacing
+from emulator.scenes.specimen import is_specimen
 
 _SHIFTS = {"FEM": "by FEM / sd", "mesh": "on a finer mesh / sd"}
 
@@ -62,14 +63,17 @@ def html_of(
     in_chains = {name: np.asarray(posterior.tree["posterior"][name]) for name in labels}
     draws = [charts.traces(labels, in_chains, posterior.model.sampled_priors)]
     draws += [charts.pairs(labels, posterior.draws())] if len(labels) > 1 else []
-    of_body = parts.note(
-        "Drag to turn. The slider goes through draws of the posterior; the menu changes the "
-        "colour; fibres and the body at rest are in the legend."
-    )
+    body: list[tuple[str, list[Markup]]] = []
+    if not is_specimen(scene):
+        of_body = parts.note(
+            "Drag to turn. The slider goes through draws of the posterior; the menu changes the "
+            "colour; fibres and the body at rest are in the legend."
+        )
+        body = [("The body", [of_body, parts.chart(body_figure(posterior, simulator))])]
     sections = [
         ("Data against prediction", data or [parts.note("The run kept no predictions.")]),
         ("Parameters", _parameters(run, posterior, certificate, labels)),
-        ("The body", [of_body, parts.chart(body_figure(posterior, simulator))]),
+        *body,
         ("What the data determine", _known(posterior)),
         ("Draws", [parts.chart(figure) for figure in draws]),
         ("Where this comes from, and how to repeat it", _provenance(run, posterior)),

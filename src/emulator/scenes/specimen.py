@@ -80,7 +80,7 @@ def states(
     Parameters
     ----------
     protocols : the name of each row's test; by default all rows are of one.
-    ordered : whether the rows of a test lead away from rest.
+    ordered : whether the rows of a test lead away from rest, with the same directions free.
 
     Raises
     ------
@@ -155,15 +155,24 @@ def _check(H: np.ndarray, free: np.ndarray, sources: Mapping[tuple[int, int], st
 
 
 def _check_path(H: np.ndarray, free: np.ndarray, rows: np.ndarray, name: str) -> None:
-    """Refuse a test that goes back: unloading, or a second test under the same name."""
+    """Refuse a test in which a stretch is missing in some rows.
+
+    Or one that goes back: unloading, or a second test under the same name.
+    """
+    test = f" of '{name}'" if name else ""
+    for axis, own in zip(AXES, free.T, strict=True):
+        if own.any() and not own.all():
+            raise InputError(
+                f"row {rows[np.argmax(own)] + 1}{test} has no stretch along {axis}, others have: "
+                "give it, leave the row out, or name another test in a column 'protocol'"
+            )
     away = np.linalg.norm(np.where(free[:, :, None] & np.eye(3, dtype=bool), 0.0, H), axis=(1, 2))
     back = np.flatnonzero(np.diff(away) < -_ROUND_OFF)
     if len(back):
-        k, test = back[0] + 1, f" of '{name}'" if name else ""
         raise InputError(
-            f"row {rows[k] + 1}{test} is nearer to rest than the one before: unloading goes "
-            "under 'unloading' in a column 'branch', another test under another name in a column "
-            f"'{PROTOCOL}'"
+            f"row {rows[back[0] + 1] + 1}{test} is nearer to rest than the one before: unloading "
+            "goes under 'unloading' in a column 'branch', another test under another name in a "
+            f"column '{PROTOCOL}'"
         )
 
 

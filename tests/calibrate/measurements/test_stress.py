@@ -10,7 +10,7 @@ from calibrate.measurements.collection import observations
 from calibrate.measurements.data import read_measurements, write_data
 from emulator.core.errors import InputError
 from emulator.scenes.scene import all_nodes
-from emulator.scenes.specimen import specimen
+from emulator.scenes.specimen import specimen, states
 from emulator.surrogates.homogeneous import Homogeneous
 
 S = np.linspace(1.0, 1.4, 5)
@@ -132,7 +132,8 @@ def test_wrong_tables_are_refused_in_one_line(tmp_path, text, message):
 
 def test_written_and_read_again(tmp_path):
     columns = {"stretch_x": S, "stretch_y": np.array([1.0, 1.05, np.nan, np.nan, 1.1])}
-    scene = neo_hookean(columns | {"shear_xz": np.linspace(0.0, 0.2, 5)})
+    columns |= {"shear_xz": np.linspace(0.0, 0.2, 5)}
+    scene = neo_hookean(states(columns, ordered=False))
     observe = observations(Stress.of(scene, "stress_x,cauchy_xz"))
     values = np.arange(10.0).reshape(5, 2)
     for name in ("data.csv", "data.nc"):
@@ -148,8 +149,6 @@ def test_written_and_read_again(tmp_path):
 
 
 def test_errors_correlate_along_a_curve_and_not_between_tests():
-    from emulator.scenes.specimen import states
-
     given = states({"stretch_x": np.array([1.0, 1.1, 1.0, 1.3])}, ["a", "a", "b", "b"])
     sites = Stress.of(neo_hookean(given), "stress_x,stress_y").sites
     np.testing.assert_allclose(sites.positions[::2, 0], [0.0, 0.1, 0.0, 0.3])

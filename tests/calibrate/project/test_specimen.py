@@ -89,4 +89,6 @@ def test_from_a_table_to_a_verdict(tmp_path):
     for name, truth in (("a", A), ("b", B)):
         assert abs(rows[name]["mean"] - truth) < 3.0 * rows[name]["sd"]
     calibrate("report", "run")
-    assert (tmp_path / "run" / "report.html").is_file()
+    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert "way from the first state" in page
+    assert "The body" not in page

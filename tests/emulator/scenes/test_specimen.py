@@ -17,7 +17,8 @@ def test_columns_are_components_of_the_gradient():
             "stretch_x": np.array([1.1, 1.2]),
             "green_y": np.array([0.105, NAN]),
             "shear_xz [%]": np.array([0.0, 5.0]),
-        }
+        },
+        ordered=False,
     )
     np.testing.assert_allclose(given.gradients[0], np.diag([0.1, 0.1, 0.0]), atol=1e-12)
     expected = np.array([[0.2, 0.0, 0.05], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
@@ -54,6 +55,10 @@ def test_columns_have_units(word, expected):
         ({"stretch_x [%]": [1.0, 1.1]}, "unit '%'"),
         ({"green_x": [-0.7]}, "goes down to -0.7"),
         ({"stretch_x": [1.0, NAN]}, "row 2 has no stretch and no shear"),
+        (
+            {"stretch_x": [1.0, 1.1, 1.2], "stretch_y": [1.0, 1.1, NAN]},
+            "row 3 has no stretch along y, others have",
+        ),
         ({"stretch_x": [1.0, 1.2, 1.1]}, "row 3 is nearer to rest than the one before: unloading"),
     ],
 )

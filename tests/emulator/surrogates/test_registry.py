@@ -22,7 +22,6 @@ from emulator.surrogates.registry import (
 )
 from linear_support import linear_forward
 
-
 OF_SPECIMENS = ("homogeneous", "incompressible")
 
 
