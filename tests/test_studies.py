@@ -93,7 +93,7 @@ FULL_ONLY = {
     "accuracy_vs_time": {"posteriors.png", "released.png"},
     "few_runs": {"meshes.png"},
     "sensitivity": {"segments.png"},
-    "sbc": {"beam.png", "ventricle.png", "noise.png", "prior.png"},
+    "sbc": {"beam.png", "ventricle.png", "specimen.png", "noise.png", "prior.png"},
 }
 
 

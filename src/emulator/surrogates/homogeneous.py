@@ -61,9 +61,9 @@ class Homogeneous:
     incompressible: bool = False
 
     def __post_init__(self) -> None:
+        closed = np.flatnonzero(~self.states.free.any(axis=1))  # refuses what is no specimen
         if self.scene.loads:
             raise InputError(f"scene '{self.scene.name}': a specimen has no loads")
-        closed = np.flatnonzero(~self.states.free.any(axis=1))
         if self.incompressible and len(closed):
             raise InputError(
                 f"state {closed[0] + 1} of '{self.scene.name}' has no free direction: an "

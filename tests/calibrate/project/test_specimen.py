@@ -85,7 +85,7 @@ def test_from_a_table_to_a_verdict(tmp_path):
     calibrate("init", "test.csv", "--law", "holzapfel_ogden_isotropic")
     result = json.loads(calibrate("infer", "test.toml", "--out", "run", "--json"))
     assert result["verdict"] == "accepted"
-    rows = result["posterior"]
+    rows = result["parameters"]
     for name, truth in (("a", A), ("b", B)):
         assert abs(rows[name]["mean"] - truth) < 3.0 * rows[name]["sd"]
     calibrate("report", "run")

@@ -111,7 +111,7 @@ def test_hard_states_are_found_or_refused():
 def test_scenes_that_are_no_specimen_are_refused(tissue):
     cube = em.find_scene("twisting_cube")
     with pytest.raises(InputError, match="is no specimen"):
-        Homogeneous(cube, all_nodes(cube)).evaluate(cube.centre)
+        Homogeneous(cube, all_nodes(cube))
     closed = specimen(
         {"stretch_x": np.array([1.1]), "stretch_y": np.array([1.0]), "stretch_z": np.array([1.0])},
         law=tissue.law, parameters=tissue.parameters, constants=tissue.constants,
