@@ -139,6 +139,11 @@ class Observation(ABC):
         """The position of each number of the data; None for what has no one position."""
         return None
 
+    @property
+    def curves(self) -> Mapping[str, tuple[np.ndarray, np.ndarray]]:
+        """The curves that the data are points of, by name: x (k,) and entries (k,) of the data."""
+        return {}
+
     def labels(self, name: str) -> Labels:
         """Return the labels of the data called ``name`` in the DataTree."""
         return {}, {}, {}

@@ -141,6 +141,21 @@ class Stress(PointObservation):
         sites = Sites.of(self.paths, len(self.components))
         return sites if self.entries is None else Sites(*(each[self.entries] for each in sites))
 
+    @property
+    def curves(self) -> Mapping[str, tuple[np.ndarray, np.ndarray]]:
+        """The curve of each test and component, over the way in stretch."""
+        every = np.arange(len(self.stretches) * len(self.components))
+        states, components = np.divmod(
+            every if self.entries is None else self.entries, len(self.components)
+        )
+        found = {}
+        for test, rows in self.tests.items():
+            for c, component in enumerate(self.components):
+                own = np.flatnonzero(np.isin(states, rows) & (components == c))
+                if len(own):
+                    found[f"{test} {component}".strip()] = self.paths[states[own], 0], own
+        return found
+
     def rows(self) -> tuple[str, np.ndarray]:
         """Return the numbers of the states."""
         return "state", np.arange(len(self.stretches))

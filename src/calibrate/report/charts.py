@@ -16,7 +16,6 @@ from calibrate.analysis.identifiability import stress_band
 from calibrate.figures import BLUE, COLOURS, VERMILION, with_unit
 from calibrate.measurements import Observation
 from calibrate.measurements.klotz import klotz_of
-from calibrate.measurements.stress import Stress
 from calibrate.measurements.volume import PressureVolume, in_mmhg, pressure_volume
 from calibrate.posterior import Posterior
 from calibrate.state_names import split
@@ -59,7 +58,7 @@ def against_data(posterior: Posterior) -> Iterator[tuple[str, go.Figure]]:
         values = np.asarray(tree["posterior_predictive"][name])
         values = values.reshape(values.shape[0] * values.shape[1], -1)
         data = np.ravel(np.asarray(posterior.data[name]))
-        if isinstance(part, Stress):
+        if part.curves:
             yield name, _curves(part, values, data)
             continue
         if values.shape[1] > 1:
@@ -101,27 +100,20 @@ def _many_numbers(name: str, part: Observation, values: np.ndarray, data: np.nda
     return figure
 
 
-def _curves(part: Stress, values: np.ndarray, data: np.ndarray) -> go.Figure:
+def _curves(part: Observation, values: np.ndarray, data: np.ndarray) -> go.Figure:
     """Return the curve of each test and component: data, and the 90 % band of predictions."""
     low, high = np.nanquantile(values, [0.05, 0.95], axis=0)
-    count, figure = len(part.components), go.Figure()
-    numbers = np.arange(values.shape[1]) if part.entries is None else part.entries
-    states, components = np.divmod(numbers, count)
-    for k, (test, rows) in enumerate(part.tests.items()):
-        for c, component in enumerate(part.components):
-            own = np.isin(states, rows) & (components == c)
-            if not own.any():
-                continue
-            colour = COLOURS[(k * count + c) % len(COLOURS)]
-            x, label = part.paths[states[own], 0], f"{test} {component}".strip()
-            figure.add_scatter(
-                x=[*x, *x[::-1]], y=[*high[own], *low[own][::-1]], fill="toself", line_width=0,
-                fillcolor=translucent(colour, 0.25), hoverinfo="skip", showlegend=False,
-                mode="lines",
-            )  # fmt: skip
-            figure.add_scatter(
-                x=x, y=data[own], mode="markers", marker={"color": colour, "size": 6}, name=label
-            )
+    figure = go.Figure()
+    for k, (label, (x, own)) in enumerate(part.curves.items()):
+        colour = COLOURS[k % len(COLOURS)]
+        figure.add_scatter(
+            x=[*x, *x[::-1]], y=[*high[own], *low[own][::-1]], fill="toself", line_width=0,
+            fillcolor=translucent(colour, 0.25), hoverinfo="skip", showlegend=False,
+            mode="lines",
+        )  # fmt: skip
+        figure.add_scatter(
+            x=x, y=data[own], mode="markers", marker={"color": colour, "size": 6}, name=label
+        )
     share = 100.0 * inside(values, data).mean()
     figure.update_layout(
         xaxis_title="way from the first state of each test, in stretch",
