@@ -41,7 +41,6 @@ from emulator.core.display import counting
 from emulator.core.errors import InputError, SolverError
 from emulator.fem import Simulator
 from emulator.fem.campaign import at_once, in_order
-from emulator.scenes.specimen import is_specimen
 
 MOST_RUNS = 30
 """Default of the largest number of solves on the finer mesh."""
@@ -93,8 +92,6 @@ def mesh_change(
         return MeshChange(why="not asked")
     if not isinstance(simulator, Simulator):
         return MeshChange(why="the simulator is not FEM's")
-    if is_specimen(simulator.scene):
-        return MeshChange(why="the states of a specimen are homogeneous on any mesh")
     try:
         error = mesh_error(simulator)
         observe = on_finer(error, predictive.model.observe)

@@ -173,7 +173,7 @@ class Physics:
 class Tail:
     """The importance weights of the FEM runs that test the corrected map.
 
-    k_hat : the Pareto shape of the tail of their weights; NaN for less than 30 runs.
+    k_hat : the Pareto shape of the tail of their weights; NaN where runs are too few.
     k_threshold : the largest Pareto shape at which their errors are trusted.
     ess : the effective number of runs.
     largest : the largest weight over the mean weight.

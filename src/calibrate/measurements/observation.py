@@ -88,6 +88,7 @@ class Observation(ABC):
     other_units : units the data may be in by mistake, each with the factor that converts it.
     usual_sd : the standard deviation of the noise where none is given; None if it must be given.
     positive : whether the number must be above 0.
+    curve_axis : the words for the x of :attr:`curves`.
     nodes : the nodes whose displacement it needs, (k,).
 
     and has ``entries`` (n,), the positions in the raveled data that are not missing, ascending;
@@ -101,6 +102,7 @@ class Observation(ABC):
     quantity: ClassVar[str]
     usual_sd: ClassVar[float | None] = None
     positive: ClassVar[bool] = True
+    curve_axis: ClassVar[str] = ""
     unit: str
     other_units: Mapping[str, float] = {}
     nodes: np.ndarray

@@ -41,14 +41,15 @@ class PointObservation(Observation):
     components : names of the components, or none.
     points : positions of the places in the reference body, mm, (d, 3).
     spread : the function of the scene, all arguments but the places, a number and a seed that
-        draws so many places at random, for words ``kind:selection:number``.
+        draws so many places at random, for words ``kind:selection:number``; None for a kind that
+        has all its places by itself.
     constants : attributes (d, 3) that go with the data in the DataTree, by the name there.
     """
 
     name: ClassVar[str]
     place_field: ClassVar[Field]
     value_fields: ClassVar[tuple[Field, ...]]
-    spread: ClassVar[Callable[..., np.ndarray]]
+    spread: ClassVar[Callable[..., np.ndarray] | None] = None
     constants: ClassVar[Mapping[str, str]] = {"position": "points"}
     components: tuple[str, ...]
     points: np.ndarray
@@ -114,8 +115,15 @@ class PointObservation(Observation):
 
     @classmethod
     def parse(cls, scene: Scene, word: str, seed: int) -> tuple[str, Self]:
-        """Read ``kind:N`` or ``kind:selection:N``: N places drawn at random."""
+        """Read ``kind:N`` or ``kind:selection:N``: N places drawn at random.
+
+        A kind that has all its places by itself is ``kind:selection``.
+        """
         kind, _, rest = word.partition(":")
+        if cls.spread is None:
+            if not rest:
+                raise cls.misuse(word)
+            return cls.name, cls.of(scene, rest)
         *selection, number = rest.rsplit(":", 1) if len(cls.arguments) > 1 else [rest]
         if not rest or len(selection) + 1 < len(cls.arguments) or not all(selection):
             raise cls.misuse(word)

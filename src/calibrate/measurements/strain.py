@@ -198,14 +198,6 @@ class SegmentStrain(Strains):
         return jnp.einsum("ds,...sc->...dc", self.weights, strains)
 
     @classmethod
-    def parse(cls, scene: Scene, word: str, seed: int) -> tuple[str, Self]:
-        """Read ``segment_strain:circumferential,radial``: strains of all 17 segments."""
-        components = word.partition(":")[2]
-        if not components:
-            raise cls.misuse(word)
-        return cls.name, cls.of(scene, components)
-
-    @classmethod
     def of(cls, scene: Scene, components: str | Sequence[str], segments: Any = None) -> Self:
         """Return the observation of mean strains along ``components`` in ``segments`` (d,).
 

@@ -1,7 +1,7 @@
 r"""Stresses of a specimen: the curves of a tensile, biaxial or shear test.
 
-With the law's first Piola-Kirchhoff stress :math:`\partial W/\partial F` at the gradient F of a
-state, and the pressure at which nothing pulls along its last free direction l,
+The stress P is that of the law less a pressure, at which nothing pulls along the last free
+direction l of a state with gradient F,
 
 .. math::
     P = \frac{\partial W}{\partial F} - p \operatorname{cof} F, \qquad
@@ -80,6 +80,7 @@ class Stress(PointObservation):
     place_field = Field("motion", ("stretch_x",), where=True)
     value_fields = (Field("stress_x", ("stress_x",)),)
     constants = {"stretch": "stretches"}
+    curve_axis = "way from the first state of each test, in stretch"
 
     def __post_init__(self) -> None:
         states_of(self.scene)  # refuses what is no specimen
@@ -96,19 +97,6 @@ class Stress(PointObservation):
         """Return the observation of ``components``, as text joined by commas."""
         texts = components.split(",") if isinstance(components, str) else components
         return cls(scene, tuple(str(text) for text in texts))
-
-    @classmethod
-    def parse(cls, scene: Scene, word: str, seed: int) -> tuple[str, Self]:
-        """Read ``stress:stress_x,stress_y``."""
-        components = word.partition(":")[2]
-        if not components:
-            raise cls.misuse(word)
-        return cls.name, cls.of(scene, components)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The one name in a file."""
-        return (self.name,)
 
     @property
     def _full_shape(self) -> tuple[int, ...]:
@@ -223,12 +211,16 @@ class Stress(PointObservation):
         return part, values
 
     def _check_signs(self, values: np.ndarray) -> None:
-        """Refuse a component that does negative work along the way from rest."""
+        """Refuse a driven component that does negative work along the way from rest.
+
+        One that moves less than a third of the largest may contract while it is pulled.
+        """
         gradients = states_of(self.scene).gradients
+        driven = np.abs(gradients).max() / 3.0
         for k, component in enumerate(self.components):
             _, row, column = _parts(component)
-            work = values[:, k] * gradients[:, row, column]
-            if np.nansum(work) < 0.0:
+            motion = gradients[:, row, column]
+            if np.nansum(values[:, k] * motion) < 0.0 and np.abs(motion).max() > driven:
                 raise InputError(
                     f"column '{component}' pulls against the motion: is its sign right, or "
                     f"its axis? ({np.nanmin(values[:, k]):.3g} to {np.nanmax(values[:, k]):.3g} "

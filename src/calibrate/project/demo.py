@@ -73,7 +73,7 @@ def run_demo(
     figure = demo.figure(posterior, fields, np.asarray(truth), run.truth)
     figure.suptitle(
         f"{forward.scene.name}: posterior by {posterior.model.forward.kind}, "
-        f"checked by FEM: {certificate.verdict} (Pareto k = {certificate.k_hat:.2f})"
+        f"checked by FEM: {certificate.verdict} ({certificate.evidence.physics.runs} runs)"
     )
     save(figure, folder / demo.picture)
     result = report(run, posterior, certificate)

@@ -112,7 +112,7 @@ def _size(table: Path, given: States) -> tuple[float, float]:
     observe, data, _ = read_measurements(neutral, table)
     if list(observe.parts) != [Stress.name]:
         raise InputError(f"data file {table} has {', '.join(observe.parts)} besides stresses")
-    largest = np.nanmax(np.abs(data[Stress.name]), axis=1, initial=0.0)
+    largest = np.nan_to_num(np.abs(data[Stress.name])).max(axis=1)
     motion = np.abs(given.gradients).max(axis=(1, 2))
     if not largest.max() > 0.0:
         raise InputError(f"data file {table}: all stresses are zero")

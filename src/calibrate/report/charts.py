@@ -101,7 +101,7 @@ def _many_numbers(name: str, part: Observation, values: np.ndarray, data: np.nda
 
 
 def _curves(part: Observation, values: np.ndarray, data: np.ndarray) -> go.Figure:
-    """Return the curve of each test and component: data, and the 90 % band of predictions."""
+    """Return each curve of an observation: data, and the 90 % band of predictions."""
     low, high = np.nanquantile(values, [0.05, 0.95], axis=0)
     figure = go.Figure()
     for k, (label, (x, own)) in enumerate(part.curves.items()):
@@ -116,8 +116,8 @@ def _curves(part: Observation, values: np.ndarray, data: np.ndarray) -> go.Figur
         )
     share = 100.0 * inside(values, data).mean()
     figure.update_layout(
-        xaxis_title="way from the first state of each test, in stretch",
-        yaxis_title=f"stress (kPa); {share:.0f} % of the data lie within 90 %",
+        xaxis_title=part.curve_axis,
+        yaxis_title=f"{part.quantity} ({part.unit}); {share:.0f} % of the data lie within 90 %",
     )
     return figure
 

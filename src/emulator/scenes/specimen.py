@@ -43,6 +43,7 @@ _RANGE = (0.2, 5.0)  # of a stretch
 _MOST_SHEAR = 3.0
 _APART = 2.0  # mm between the tetrahedra of two states
 _ROUND_OFF = 1e-9
+_CORNER = "corner."  # before the names of the sets that supports hold; other sets are tests
 
 
 class States(NamedTuple):
@@ -179,7 +180,7 @@ def _check_path(H: np.ndarray, free: np.ndarray, rows: np.ndarray, name: str) ->
 def body_of(given: States) -> tuple[Mesh, tuple[Support, ...]]:
     """Return the tetrahedra of states side by side, and the supports that prescribe them.
 
-    Sets are ``origin``, ``x``, ``y`` and ``z``, the corners, and each test by its name.
+    Sets are ``corner.origin``, ``corner.x`` and so on, and each test by its name.
     """
     H, free, protocols = given
     count = len(H)
@@ -188,14 +189,15 @@ def body_of(given: States) -> tuple[Mesh, tuple[Support, ...]]:
     corners = np.vstack([np.zeros(3), np.eye(3)])
     nodes = (_APART * places[:, None] + corners).reshape(-1, 3)
     elements = np.arange(4 * count).reshape(count, 4)
-    sets = {"origin": elements[:, 0], **{a: elements[:, k + 1] for k, a in enumerate(AXES)}}
-    supports = [Support("origin")]
+    sets = {f"{_CORNER}origin": elements[:, 0]}
+    supports = [Support(f"{_CORNER}origin")]
     for k, axis in enumerate(AXES):
-        supports.append(Support(axis, H[:, :, k], components=AXES.replace(axis, "")))
-        held = np.flatnonzero(~free[:, k])
+        name, held = f"{_CORNER}{axis}", np.flatnonzero(~free[:, k])
+        sets[name] = elements[:, k + 1]
+        supports.append(Support(name, H[:, :, k], components=AXES.replace(axis, "")))
         if len(held):
-            sets[f"{axis}_held"] = elements[held, k + 1]
-            supports.append(Support(f"{axis}_held", H[held, :, k], components=axis))
+            sets[f"{name}.held"] = elements[held, k + 1]
+            supports.append(Support(f"{name}.held", H[held, :, k], components=axis))
     tests = {name: elements[rows].ravel() for name, rows in protocols.items() if name}
     return Mesh(nodes, elements, {**tests, **sets}), tuple(supports)
 
@@ -225,6 +227,9 @@ def read_states(path: Path) -> States:
     columns = {w: np.array([cells.number(k, w, gaps=True) for k in rows]) for w in words}
     names = [cells.rows[k][PROTOCOL] for k in rows] if PROTOCOL in cells.words else None
     try:
+        if names is not None and "" in names:
+            row = names.index("") + 1
+            raise InputError(f"row {row}, column '{PROTOCOL}' is empty; name the row's test")
         return states(columns, names)
     except InputError as error:
         raise InputError(f"data file {path}: {error}") from error
@@ -251,10 +256,9 @@ def states_of(scene: Scene) -> States:
     owner = np.repeat(np.arange(len(corners)), 4)
     order = np.argsort(scene.mesh.elements.ravel())
     of_node = owner[order]
-    fixed = {"origin", *AXES, *(f"{axis}_held" for axis in AXES)}
     tests = {
         name: np.unique(of_node[nodes])
         for name, nodes in scene.mesh.node_sets.items()
-        if name not in fixed
+        if not name.startswith(_CORNER)
     }
     return States(H, free, tests or {"": np.arange(len(corners))})

@@ -154,3 +154,15 @@ def test_errors_correlate_along_a_curve_and_not_between_tests():
     np.testing.assert_allclose(sites.positions[::2, 0], [0.0, 0.1, 0.0, 0.3])
     assert len(np.unique(sites.positions[:, 1])) == 2
     np.testing.assert_array_equal(sites.component, [0, 1] * 4)
+
+
+def test_a_direction_may_contract_while_it_is_pulled(tmp_path):
+    text = "stretch_x,stretch_y,stress_x,stress_y\n1,1,0,0\n0.98,1.1,0.5,4\n0.97,1.2,1,9\n"
+    (tmp_path / "table.csv").write_text(text)
+    scene = neo_hookean(
+        {"stretch_x": np.array([1.0, 0.98, 0.97]), "stretch_y": np.array([1.0, 1.1, 1.2])}
+    )
+    assert read_measurements(scene, tmp_path / "table.csv")[1]["stress"].shape == (3, 2)
+    (tmp_path / "table.csv").write_text(text.replace(",4\n", ",-4\n").replace(",9\n", ",-9\n"))
+    with pytest.raises(InputError, match="column 'stress_y' pulls against the motion"):
+        read_measurements(scene, tmp_path / "table.csv")

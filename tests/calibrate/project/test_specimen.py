@@ -49,6 +49,7 @@ def test_files_are_written_and_say_what_was_guessed(tmp_path):
 def test_any_law_is_drafted(tmp_path, law, lacks):
     (tmp_path / "test.csv").write_text(table())
     draft = draft_specimen(tmp_path / "test.csv", tmp_path / "test.toml", law=law)
+    assert draft.scene.law.name == law
     assert lacks is None or lacks not in draft.scene_path.read_text()
 
 

@@ -91,14 +91,14 @@ def of_law(given, **entries):
 
 def test_a_scene_has_the_states_that_made_it():
     columns = {"stretch_x": np.array([1.1, NAN, 1.3]), "shear_yz": np.array([0.0, 0.2, 0.1])}
-    given = states(columns, ["pull", "shear", "both"])
+    given = states(columns, ["x", "shear", "origin"])  # names that corners might have
     again = states_of(of_law(given))
     np.testing.assert_array_equal(again.gradients, given.gradients)
     np.testing.assert_array_equal(again.free, given.free)
     assert {n: r.tolist() for n, r in again.protocols.items()} == {
-        "pull": [0],
+        "x": [0],
         "shear": [1],
-        "both": [2],
+        "origin": [2],
     }
     with pytest.raises(InputError, match="is no specimen"):
         states_of(em.find_scene("twisting_cube"))
@@ -126,6 +126,10 @@ def test_a_scene_file_names_the_table(tmp_path):
     assert scene.mesh.node_set("pull").tolist() == list(range(8))
     (tmp_path / "scene.toml").write_text(SCENE.replace("[parameters", "order = 2\n[parameters", 1))
     with pytest.raises(InputError, match="line 4: a specimen has none"):
+        read_scene(tmp_path / "scene.toml")
+    (tmp_path / "table.csv").write_text("protocol,stretch_x,stress_x\na,1.0,0\n,1.1,1\n")
+    (tmp_path / "scene.toml").write_text(SCENE)
+    with pytest.raises(InputError, match=r"row 2, column 'protocol' is empty"):
         read_scene(tmp_path / "scene.toml")
     (tmp_path / "table.csv").write_text("stretch_x,stress_x\n1.0,0\n112,1\n")
     (tmp_path / "scene.toml").write_text(SCENE)
