@@ -156,6 +156,7 @@ def main() -> None:
     """Run the study."""
     words = parser(__doc__, HERE)
     words.add_argument("--only", nargs="+", choices=PARTS, help="parts to run")
+    words.add_argument("--ways", nargs="+", choices=posteriors.WAYS, help="posteriors to draw")
     words.add_argument("--stages", action="append", choices=ALL, help="stages of bodies to run")
     words.add_argument("--published", type=Path, help="folder of the released data")
     words.add_argument(
@@ -176,7 +177,7 @@ def main() -> None:
         if name in NAMES:
             of_body(results, name, arguments)
             continue
-        for way in posteriors.WAYS:
+        for way in arguments.ways or posteriors.WAYS:
             results.case(
                 f"posterior: {way}",
                 lambda way=way: printed("accuracy_vs_time", "--part", way, compiled=False),

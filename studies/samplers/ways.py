@@ -23,6 +23,7 @@ CHAINS = 4
 FREEDOM = 5.0  # of the reference's proposal, a Student t
 OF_PRIOR = 0.3  # share of the reference's points that are drawn from the prior
 MOST_NESTED_STEPS = 4000
+NUMPYRO = "NumPyro's NUTS"
 
 
 class Drawn(NamedTuple):
@@ -144,7 +145,7 @@ def ways(model: Model, data: dict[str, Any], count: int) -> dict[str, Way]:
     checked = model.check_data(data)
     return {
         **{name: _ours(name, model, data, count) for name in ("importance", "nuts")},
-        "NumPyro's NUTS": _numpyro(model, checked, count),
+        NUMPYRO: _numpyro(model, checked, count),
         "BlackJAX's NUTS": _blackjax_nuts(model, checked, count),
         "BlackJAX's nested sampling": _nested(model, checked, count),
     }

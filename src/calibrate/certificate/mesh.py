@@ -1,11 +1,13 @@
-r"""What a finer mesh would change of a posterior.
+r"""What a finer mesh would change of a posterior, or the grips of a specimen.
 
 FEM is solved at a few points of the posterior, on its mesh and on the next finer one
-(:mod:`emulator.accuracy.mesh_error`). The difference :math:`D` in the data varies little over a
-posterior, and a Gaussian process of theta continues it (:mod:`calibrate.certificate.predictive`).
-Added to the map's error on the mesh, it gives a posterior under the finer mesh's FEM, and the pool
-follows that posterior. The change is from the corrected posterior to this one, over the same points
-of the pool. Its error is the jackknife's over the solves on the finer mesh, and over the pool.
+(:mod:`emulator.accuracy.mesh_error`). For a specimen of homogeneous states the finer one is the
+piece between its grips (:mod:`emulator.surrogates.gripped`). The difference :math:`D` in the data
+varies little over a posterior, and a Gaussian process of theta continues it
+(:mod:`calibrate.certificate.predictive`). Added to the map's error on the mesh, it gives a
+posterior under the finer mesh's FEM, and the pool follows that posterior. The change is from the
+corrected posterior to this one, over the same points of the pool. Its error is the jackknife's over
+the solves on the finer mesh, and over the pool.
 
 Solves on the finer mesh are dear. The first four points lie in the corrected posterior; where they
 leave no doubt, with twice the margin, there are no others. Otherwise half as many again follow, in
@@ -14,13 +16,11 @@ the posterior under the finer mesh's FEM as it is known by then, until every fig
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
+from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from tqdm import tqdm
 
 from calibrate.certificate.estimates import as_figures, jackknife, moments
@@ -34,13 +34,12 @@ from calibrate.certificate.predictive import (
 )
 from calibrate.certificate.runs import Runs
 from calibrate.certificate.verdict import MeshChange, all_within
-from calibrate.measurements import Observations
-from calibrate.measurements.outputs import on_finer
-from emulator.accuracy.mesh_error import MeshError, MeshErrorEstimate, mesh_error
+from calibrate.statistical_model.finer_fem import Finer, FinerFEM, finer_fem
+from emulator.accuracy.mesh_error import MeshErrorEstimate
 from emulator.core.display import counting
 from emulator.core.errors import InputError, SolverError
 from emulator.fem import Simulator
-from emulator.fem.campaign import at_once, in_order
+from emulator.fem.campaign import in_order
 
 MOST_RUNS = 30
 """Default of the largest number of solves on the finer mesh."""
@@ -93,8 +92,7 @@ def mesh_change(
     if not isinstance(simulator, Simulator):
         return MeshChange(why="the simulator is not FEM's")
     try:
-        error = mesh_error(simulator)
-        observe = on_finer(error, predictive.model.observe)
+        finer = finer_fem(predictive.model, simulator)
     except InputError as reason:
         return MeshChange(why=str(reason))
     states = len(predictive.model.states.states)
@@ -102,54 +100,43 @@ def mesh_change(
     with counting(
         total=points[1] * states, desc="finer mesh", disable=not progress, unit="solve"
     ) as bar:
-        differences = _differences_of_fem(predictive, error, observe, bar)
+        differences = _differences_of_fem(predictive, finer, bar)
         model_error = predictive.model.error
         widened = model_error is not None and model_error.of_mesh
         change = change_by(differences, pool, runs, points, rng, widened=widened)
-    error.forget()
+    finer.forget()
     return replace(
         change,
         runs=change.runs * states,
         failed=change.failed * states,
-        nodes=len(error.finer.scene.mesh.nodes),
+        nodes=finer.nodes,
         linear=simulator.scene.mesh.order == 1,
+        gripped=simulator.scene.grips is not None,
     )
 
 
-def _differences_of_fem(
-    predictive: Predictive, error: MeshError, observe: Observations, bar: tqdm
-) -> Differences:
-    """Return FEM's differences; solves on the finer mesh run in parallel.
+def _differences_of_fem(predictive: Predictive, finer: FinerFEM, bar: tqdm) -> Differences:
+    """Return FEM's differences; solves of the finer FEM run in parallel.
 
     Each starts from the finer solutions of its own point's earlier states, of the first point, and
     of earlier calls: never from what another thread may have finished or not.
     """
-    model = predictive.model
     known: list[MeshErrorEstimate] = []
-    workers = at_once(error.simulator, len(error.finer.scene.mesh.nodes))
 
-    def flat(observe: Observations, thetas: jax.Array, fields: list[jax.Array]) -> np.ndarray:
-        stacked = jnp.stack([u[observe.nodes] for u in fields])
-        return np.asarray(ravel_pytree(observe(stacked, thetas))[0])
-
-    def difference(thetas: jax.Array) -> tuple[np.ndarray | None, list[MeshErrorEstimate]]:
-        own: list[MeshErrorEstimate] = []
+    def difference(draw: Mapping[str, Any]) -> Finer | None:
         try:
-            for theta in thetas:
-                own.append(error(theta, model.full(theta), known=[*known, *own]))
+            return finer(draw, known)
         except SolverError:
-            return None, []
-        fine = flat(observe, thetas, [each.fine for each in own])
-        return fine - flat(model.observe, thetas, [each.coarse for each in own]), own
+            return None
 
     def differences(z: np.ndarray) -> Iterator[np.ndarray | None]:
         draws, later = predictive.constrain(z), list[MeshErrorEstimate]()
         each = ({name: values[k] for name, values in draws.items()} for k in range(len(z)))
-        results = in_order(difference, map(model.states.thetas, each), workers)
-        for number, (result, found) in enumerate(results):
-            (later if number else known).extend(found)  # the first point is solved alone
-            bar.update(len(model.states.states))
-            yield result
+        for number, found in enumerate(in_order(difference, each, finer.workers)):
+            if found is not None:  # the first point is solved alone
+                (later if number else known).extend(found.estimates)
+            bar.update(len(predictive.model.states.states))
+            yield None if found is None else found.fine - found.coarse
         known.extend(later)
 
     return differences

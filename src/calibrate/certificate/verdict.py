@@ -54,6 +54,10 @@ _MANY = 20.0  # factor in the number of runs above which the estimate of that fa
 _MORE = "more FEM runs (--until decided)"
 _WIDEN = "or allow for it in the likelihood (--mesh-error)"
 _QUADRATIC = f"make the elements quadratic (order = 2), {_WIDEN}"
+_LEARN_GRIPS = (
+    "calibrate on the gripped piece (calibrate train SCENE --out grips.safetensors, then learned = "
+    f'"grips.safetensors" under [grips] of the scene), {_WIDEN}'
+)
 _REFINE = f"emulate the finer mesh (calibrate train finer:SCENE --recipe two_meshes), {_WIDEN}"
 
 
@@ -124,12 +128,15 @@ class Changes:
 
 @dataclass(frozen=True)
 class MeshChange(Changes):
-    """The changes of means and sds by a finer mesh; no figures where nothing is known.
+    """The changes of means and sds by a finer mesh, or by the grips of a specimen.
+
+    There are no figures where nothing is known.
 
     nodes : the number of nodes of the finer mesh.
     runs, failed : the numbers of solves on the finer mesh, and of those that did not converge.
     linear : whether the coarser mesh has linear elements.
     widened : whether the likelihood allows for the error of the mesh.
+    gripped : whether the finer mesh is of a specimen between its grips.
     why : the reason for which no finer mesh was solved; empty if one was.
     """
 
@@ -138,7 +145,14 @@ class MeshChange(Changes):
     failed: int = 0
     linear: bool = False
     widened: bool = False
+    gripped: bool = False
     why: str = ""
+
+    @property
+    def place(self) -> str:
+        """Where the solves are, in words."""
+        where = "between its grips" if self.gripped else "on a finer mesh"
+        return f"{where} ({self.nodes} nodes)"
 
     def comparisons(self) -> list[Comparison]:
         """Return every figure with its limit."""
@@ -286,6 +300,7 @@ class Certificate(TableRepr):
                 "runs": e.mesh.runs,
                 "failed": e.mesh.failed,
                 "not_asked": e.mesh.why,
+                "gripped": e.mesh.gripped,
             },
             "box": [asdict(end) for end in e.box],
             "misfit": {name: asdict(m) for name, m in e.misfit.items()},
@@ -336,21 +351,26 @@ def _mesh(mesh: MeshChange) -> tuple[bool | None, list[Finding]]:
     """Return whether the posterior stays on a finer mesh, ``None`` if undecided, and findings."""
     if mesh.why:
         return True, [(f"no finer mesh was asked: {mesh.why}", "")]
-    finer = f"on a finer mesh ({mesh.nodes} nodes)"
+    finer = mesh.place
     if not mesh.shift:
         failed = f"FEM failed at {mesh.failed} of {mesh.runs} points {finer}"
-        return None, [(failed, "refine the mesh")]
+        return None, [
+            (failed, "check the size of the piece" if mesh.gripped else "refine the mesh")
+        ]
     within = all_within(comparisons := mesh.comparisons())
     if within:
         worst = max(abs(figure.value) for figure in mesh.shift.values())
-        words = f"mesh: {finer} no mean would move by more than {worst:.2f} posterior sd"
+        row = "grips" if mesh.gripped else "mesh"
+        words = f"{row}: {finer} no mean would move by more than {worst:.2f} posterior sd"
         return True, [(f"{words}, which is widened for it" if mesh.widened else words, "")]
     decisive = [w for w, figure, limit in comparisons if figure.within(limit) is within]
     if within is None:
         close = f"{finer} the {decisive[0]}, too close to the limit for its error"
         return None, [(close, f"give more runs there (--mesh-runs {2 * mesh.runs})")]
     remedy = _QUADRATIC if mesh.linear else _REFINE
-    if mesh.widened:
+    if mesh.gripped:
+        remedy = _LEARN_GRIPS
+    elif mesh.widened:
         remedy = "learn the error of the mesh from more runs, or emulate the finer mesh"
     return False, [(f"{finer} the {each}", remedy) for each in decisive]
 

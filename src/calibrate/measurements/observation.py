@@ -238,6 +238,15 @@ class Observation(ABC):
         """Return the data without noise (..., *shape), from one load state; see ``evaluate``."""
         return self.evaluate(displacement, theta)
 
+    def gripped(self, shares: np.ndarray) -> Self:
+        """Return the observation with what the grips of a specimen add to its stresses.
+
+        shares : the part (d, 3, 3) of each state's homogeneous stress.
+
+        :class:`InputError` for an observation that is not of such stresses.
+        """
+        raise InputError(f"'{self.kind}' says nothing of a specimen's grips")
+
     @property
     def default_noise(self) -> GaussianNoise:
         """The noise of an observation that names none; :class:`InputError` if it must."""

@@ -1,15 +1,10 @@
 r"""Stresses of a specimen: the curves of a tensile, biaxial or shear test.
 
-The stress P is that of the law less a pressure, at which nothing pulls along the last free
-direction l of a state with gradient F,
+From the first Piola-Kirchhoff stress P of a state of gradient F
+(:func:`~emulator.surrogates.homogeneous.homogeneous_stresses`), and what grips add to it
+(:mod:`emulator.surrogates.gripped`), follow
 
-.. math::
-    P = \frac{\partial W}{\partial F} - p \operatorname{cof} F, \qquad
-    p = \frac{\partial W}{\partial F_{ll}} \Big/ \operatorname{cof}(F)_{ll}, \qquad
-    \sigma = P F^T / J, \qquad S = F^{-1} P .
-
-The pressure vanishes where a compressible specimen is in equilibrium, and is the unknown of an
-incompressible one.
+.. math:: \sigma = P F^T / J, \qquad S = F^{-1} P .
 
 ========================  ====================================================
 column                    is
@@ -29,6 +24,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
@@ -41,10 +37,11 @@ from calibrate.measurements.observation import Block, Field, Table
 from calibrate.measurements.points import PointObservation
 from calibrate.noise.protocol import Sites
 from emulator.core.errors import InputError
-from emulator.fem.energy import point_energy
 from emulator.mechanics.kinematics import cofactor, determinant
 from emulator.scenes.scene import Scene, all_nodes
 from emulator.scenes.specimen import AXES, motion_columns, states, states_of, with_unit
+from emulator.surrogates.gripped import added, gripped_stresses
+from emulator.surrogates.homogeneous import homogeneous_stresses
 
 _COMPONENT = re.compile(r"(stress|cauchy|second)_([xyz])([xyz])?")
 _PULL = re.compile(r"force(_[xyz][xyz]?)")
@@ -64,10 +61,12 @@ class Stress(PointObservation):
 
     scene : the specimen.
     components : such as ``stress_x`` or ``cauchy_xy``.
+    shares : what grips add, (d, 3, 3), in place of what the scene's grips have learned.
     """
 
     scene: Scene
     components: tuple[str, ...]
+    shares: jax.Array | None = None
 
     kind = "stress"
     usage = "stress:COMPONENT,..."
@@ -116,10 +115,10 @@ class Stress(PointObservation):
     @cached_property
     def paths(self) -> np.ndarray:
         """The way of each state from the first of its test, in stretch, and the test's place."""
-        gradients, paths = states_of(self.scene).gradients, np.zeros((len(self.stretches), 3))
+        given = states_of(self.scene)
+        paths = np.zeros((len(given.free), 3))
+        paths[:, 0] = given.paths
         for number, rows in enumerate(self.tests.values()):
-            steps = np.linalg.norm(np.diff(gradients[rows], axis=0), axis=(1, 2))
-            paths[rows, 0] = np.concatenate([[0.0], np.cumsum(steps)])
             paths[rows, 1] = _APART * number
         return paths
 
@@ -144,6 +143,19 @@ class Stress(PointObservation):
                     found[f"{test} {component}".strip()] = self.paths[states[own], 0], own
         return found
 
+    def gripped(self, shares: np.ndarray) -> Self:
+        """Return the same stresses with what grips add, (d, 3, 3) as shares of a state's stress.
+
+        :class:`InputError` where a component acts on no grip.
+        """
+        for component in self.components:
+            _, row, column = _parts(component)
+            if np.isnan(shares[:, row, column]).all():
+                raise InputError(f"'{component}' acts on no grip of the piece")
+        part = copy(self)  # with the entries that are not missing
+        part._derive(shares=jnp.asarray(np.nan_to_num(shares)))
+        return part
+
     def rows(self) -> tuple[str, np.ndarray]:
         """Return the numbers of the states."""
         return "state", np.arange(len(self.stretches))
@@ -153,24 +165,15 @@ class Stress(PointObservation):
         return jnp.vectorize(self._stresses, signature="(k,i),(p)->(d,c)")(displacement, theta)
 
     def _stresses(self, u: jax.Array, theta: jax.Array) -> jax.Array:
-        elements, free = self.scene.mesh.elements, states_of(self.scene).free
-        H = jnp.swapaxes(u[elements[:, 1:]] - u[elements[:, :1]], 1, 2)
-        tissue = jax.tree.map(lambda each: each[:, 0], self.scene.tissue_at(theta))
-        law_stress = jax.vmap(jax.grad(point_energy(self.scene, theta)))(H, tissue)
-        last = np.where(free.any(axis=1), 2 - np.argmax(free[:, ::-1], axis=1), 3)
-        return jax.vmap(self._components)(H, law_stress, jnp.asarray(last))
+        H, P = homogeneous_stresses(self.scene, u, theta)
+        P = gripped_stresses(self.scene, P, theta) if self.shares is None else added(P, self.shares)
+        return jax.vmap(self._components)(H, P)
 
-    def _components(self, H: jax.Array, stress: jax.Array, last: jax.Array) -> jax.Array:
-        """Return the observed components (c,) from the law's stress dW/dF (3, 3) of a state.
-
-        last : the axis of the last free direction; 3 where there is none.
-        """
-        F, free = H + jnp.eye(3), jnp.arange(3) == last
-        cofactors = cofactor(F)
-        along = jnp.where(free, jnp.diagonal(cofactors), 1.0)
-        pressure = jnp.sum(jnp.where(free, jnp.diagonal(stress) / along, 0.0))
-        P, J = stress - pressure * cofactors, determinant(F)
-        of_measure = {"stress": P, "cauchy": P @ F.T / J, "second": cofactors.T @ P / J}
+    def _components(self, H: jax.Array, P: jax.Array) -> jax.Array:
+        """Return the observed components (c,) from the stress (3, 3) of a state."""
+        F = H + jnp.eye(3)
+        J = determinant(F)
+        of_measure = {"stress": P, "cauchy": P @ F.T / J, "second": cofactor(F).T @ P / J}
         numbers = []
         for component in self.components:
             measure, row, column = _parts(component)

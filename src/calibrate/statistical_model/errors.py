@@ -33,15 +33,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from calibrate.measurements.outputs import on_finer
 from calibrate.model_error.kinds import Measured, read_systematic
 from calibrate.model_error.marginal import Amplitude, ModelError
 from calibrate.model_error.systematic import Systematic, marginalised
 from calibrate.noise import information_about_means
 from calibrate.statistical_model.fem_likelihood import FEMLikelihood
+from calibrate.statistical_model.finer_fem import finer_fem
 from calibrate.statistical_model.model import Model
 from emulator.accuracy.estimate import newton_distance
-from emulator.accuracy.mesh_error import MeshErrorEstimate, mesh_error
+from emulator.accuracy.mesh_error import MeshErrorEstimate
 from emulator.core.display import counting
 from emulator.core.errors import InputError, SolverError
 from emulator.fem import Simulator
@@ -150,8 +150,8 @@ def with_error(
 
     Parameters
     ----------
-    of_mesh : whether to solve on the next finer mesh of the body, so that the mesh's error is
-        allowed for, too.
+    of_mesh : whether to solve on the next finer mesh of the body, or a specimen between its grips,
+        so that this error is allowed for, too.
     seed : the seed from which the draws of the prior are drawn.
 
     Raises
@@ -167,22 +167,23 @@ def with_error(
         raise InputError("error of the forward map: the simulator is for another scene")
     information = _noise_information(model, "error of the forward map")
     predict = jax.jit(model.predict)
-    fem, start = FEMLikelihood(model, simulator), jax.jit(model.full)
-    finer = mesh_error(simulator) if of_mesh else None
+    fem = FEMLikelihood(model, simulator)
+    finer = finer_fem(model, simulator) if of_mesh else None
     known: list[MeshErrorEstimate] = []
-    observe = model.observe if finer is None else on_finer(finer, model.observe)
 
-    def solve(draw: Mapping[str, Any]) -> list[jax.Array] | None:
-        """Return FEM's displacement in each load state; None where there is none."""
-        if finer is None:
-            return next(fem.equilibria([draw]))[1]
-        begun = len(known)
-        try:
-            for theta in model.states.thetas(draw):
-                known.append(finer(theta, start(theta), known=known))
-        except SolverError:
+    def solve(draw: Mapping[str, Any]) -> np.ndarray | None:
+        """Return FEM's data, flat (m,); None where it does not converge."""
+        if finer is not None:
+            try:
+                found = finer(draw, known)
+            except SolverError:
+                return None
+            known.extend(found.estimates)
+            return found.fine
+        if (fields := next(fem.equilibria([draw]))[1]) is None:
             return None
-        return [each.fine for each in known[begun:]]
+        seen = jnp.stack([u[model.observe.nodes] for u in fields])
+        return np.asarray(ravel_pytree(model.observe(seen, model.states.thetas(draw)))[0])
 
     draws = model.prior_draws(jax.random.key(seed), runs)
     unknowns, errors = [], []
@@ -190,10 +191,8 @@ def with_error(
     for k in counting(range(runs), what, disable=not progress, unit="run"):
         values = {name: draw[k] for name, draw in draws.items()}
         means, valid = predict(values)
-        if bool(valid) and (fields := solve(values)) is not None:
-            seen = jnp.stack([u[observe.nodes] for u in fields])
-            exact = observe(seen, model.states.thetas(values))
-            errors.append(ravel_pytree(exact)[0] - ravel_pytree(means)[0])
+        if bool(valid) and (exact := solve(values)) is not None:
+            errors.append(exact - np.asarray(ravel_pytree(means)[0]))
             unknowns.append([float(values[name]) for name in model.states.unknowns])
     if len(errors) < FEWEST:
         raise InputError(

@@ -16,6 +16,7 @@ from emulator.geometry.mesh import Mesh
 from emulator.geometry.refinement import to_quadratic
 from emulator.geometry.side_by_side import check_name, shifted, side_by_side
 from emulator.mechanics.laws import Law, find_law
+from emulator.scenes.grips import Grips, Learned
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
 from emulator.scenes.scene_data import directions_read
@@ -65,6 +66,8 @@ def read_scene(path: str | Path) -> Scene:
         with source.at("parameters", name):
             parameters.append(Parameter(name, entry.unit, *entry.range, entry.scale))
     _check_sets(mesh, source)
+    with source.at("grips", table=("grips",)):
+        grips = _grips(path.parent, file)
     try:
         return Scene(
             name=path.stem,
@@ -82,6 +85,7 @@ def read_scene(path: str | Path) -> Scene:
             constants=file.constants,
             dilatation=file.dilatation,
             loaded_by=file.loaded_by,
+            grips=grips,
         )
     except InputError as error:
         raise source.error(str(error), _quantity_in(str(error), file)) from error
@@ -96,6 +100,17 @@ def _specimen(folder: Path, file: SceneFile, source: Source) -> tuple[Body, tupl
         assert file.specimen is not None
         mesh, supports = body_of(read_states(folder / file.specimen))
     return Body(mesh), supports
+
+
+def _grips(folder: Path, file: SceneFile) -> Grips | None:
+    """Return how the specimen was held, with what has been learned of its grips."""
+    if file.grips is None:
+        return None
+    if file.specimen is None:
+        raise InputError("only a specimen has grips; hold a mesh by [[supports]]")
+    entries = file.grips.model_dump()
+    learned = entries.pop("learned")
+    return Grips(**entries, learned=Learned.read(folder / learned) if learned else None)
 
 
 def _one_body(folder: Path, file: SceneFile, law: Law, source: Source) -> tuple[Body, Regions]:

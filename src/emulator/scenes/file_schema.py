@@ -52,6 +52,25 @@ class BodyTable(Table):
     """by how much it is moved, mm; bodies do not feel each other, but no nodes may coincide."""
 
 
+class GripsTable(Table):
+    """How a specimen was held, which tells what its grips do to the posterior."""
+
+    size: tuple[float, float, float]
+    """lengths of the piece between its grips along x, y and z, mm."""
+    held: Literal["clamped", "hooks"] = "clamped"
+    """clamped: faces that do not deform, in jaws or glued to plates; hooks: points of the edges."""
+    hooks: int = 5
+    """number of hooks of an edge."""
+    cells: int = 8
+    """number of elements along the longest side."""
+    marks: float | None = None
+    """side of the square in the middle in which stretches were measured, mm; left out where they
+    are those of the grips."""
+    learned: str | None = None
+    """file of calibrate train, which adds what the grips do to the stresses; relative to this
+    file."""
+
+
 class SceneFile(Table):
     """A whole scene file."""
 
@@ -64,6 +83,8 @@ class SceneFile(Table):
     specimen: str | None = None
     """in place of mesh, a table (CSV or spreadsheet) of the states of a tested specimen, relative
     to this file: docs/specimens.md."""
+    grips: GripsTable | None = None
+    """how the specimen was held; without it, states are homogeneous and nothing else is asked."""
     parameters: dict[str, ParameterTable]
     """what varies: parameters of the law, of loads and of regions."""
     supports: tuple[Annotated[BoundaryCondition, OneOf("kind", SUPPORTS, "held")], ...] = ()

@@ -19,6 +19,7 @@ from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws import Law
 from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.fibre_rules import FibreRule
+from emulator.scenes.grips import Grips
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.part import BoundaryCondition, Load, Prescribed
 from emulator.scenes.supports.dirichlet import check_motions, prescribe
@@ -68,6 +69,7 @@ class SceneData:
         load parameter of theta the name of the parameter or constant that holds its value there,
         ``{"pressure": "imaged"}``. A simulator then unloads and loads
         (:mod:`emulator.fem.loaded`), and displacements are those from the mesh.
+    grips : how a specimen was held (:mod:`emulator.scenes.gripped`).
     """
 
     name: str
@@ -85,6 +87,7 @@ class SceneData:
     fibre_rule: FibreRule | None = None
     angles: tuple[FibreAngles, ...] = ()
     loaded_by: Mapping[str, str] = field(default_factory=dict)
+    grips: Grips | None = None
 
     def __post_init__(self) -> None:
         for name in ("constants", "origin", "loaded_by"):

@@ -58,6 +58,15 @@ class States(NamedTuple):
     free: np.ndarray
     protocols: Mapping[str, np.ndarray]
 
+    @property
+    def paths(self) -> np.ndarray:
+        """The way (m,) of each state from the first of its test, in stretch."""
+        found = np.zeros(len(self.gradients))
+        for rows in self.protocols.values():
+            steps = np.linalg.norm(np.diff(self.gradients[rows], axis=0), axis=(1, 2))
+            found[rows[1:]] = np.cumsum(steps)
+        return found
+
 
 def with_unit(word: str) -> tuple[str, str]:
     """Return the name and the unit of a column such as ``stress_x [kPa]``; no unit is empty."""

@@ -133,6 +133,34 @@ class Homogeneous:
         return replace(self, nodes=check_nodes(self.scene, nodes))
 
 
+def homogeneous_stresses(
+    scene: Scene, u: jax.Array, theta: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    r"""Return gradients H and first Piola-Kirchhoff stresses P in kPa of the states, (m, 3, 3).
+
+    P is the law's stress less a pressure, at which nothing pulls along the last free direction l,
+
+    .. math::
+        P = \frac{\partial W}{\partial F} - p \operatorname{cof} F, \qquad
+        p = \frac{\partial W}{\partial F_{ll}} \Big/ \operatorname{cof}(F)_{ll} .
+
+    It vanishes where a compressible specimen is in equilibrium, and is the unknown of an
+    incompressible one.
+
+    u : the displacement (n, 3) mm of all nodes of the specimen ``scene``.
+    """
+    elements, free = scene.mesh.elements, states_of(scene).free
+    H = jnp.swapaxes(u[elements[:, 1:]] - u[elements[:, :1]], 1, 2)
+    tissue = jax.tree.map(lambda each: each[:, 0], scene.tissue_at(theta))
+    of_law = jax.vmap(jax.grad(point_energy(scene, theta)))(H, tissue)
+    last = np.where(free.any(axis=1), 2 - np.argmax(free[:, ::-1], axis=1), 3)
+    cofactors = jax.vmap(cofactor)(H + jnp.eye(3))
+    is_last = jnp.asarray(last[:, None] == np.arange(3))
+    along = jnp.where(is_last, jnp.diagonal(cofactors, axis1=1, axis2=2), 1.0)
+    pulls = jnp.where(is_last, jnp.diagonal(of_law, axis1=1, axis2=2) / along, 0.0)
+    return H, of_law - pulls.sum(axis=1)[:, None, None] * cofactors
+
+
 class Point(NamedTuple):
     """The law at one point, as functions of displacement gradient (3, 3) and tissue.
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from collections.abc import Mapping
 from dataclasses import fields, replace
+from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from calibrate.cli.words import Answer, add_scene, command, flag, option, scene_of, seconds
@@ -12,6 +14,7 @@ from emulator.core.errors import InputError
 from emulator.core.store import check_folder
 
 if TYPE_CHECKING:
+    from emulator.scenes.scene import Scene
     from emulator.training.plan import Plan
 
 
@@ -79,6 +82,8 @@ def train(arguments: Namespace) -> Answer:
     from emulator.training import train as train_emulator
 
     scene = scene_of(arguments)
+    if scene.grips is not None:
+        return _train_grips(scene, arguments)
     check_folder(arguments.out)
     entries = _plan_entries(arguments)
     start = load(arguments.start) if arguments.start else None
@@ -122,6 +127,31 @@ def train(arguments: Namespace) -> Answer:
     text += f"\nwritten to {arguments.out}; next: calibrate infer {arguments.scene} "
     text += f"--emulator {arguments.out} --data measured.csv --out RUN"
     return Answer({"out": arguments.out, **record}, text)
+
+
+def _train_grips(scene: Scene, arguments: Namespace) -> Answer:
+    """Learn and write what the grips of a specimen add to its stresses."""
+    from emulator.surrogates.gripped import RUNS, learn_grips
+
+    out = Path(arguments.out)
+    if out.suffix != ".safetensors":
+        raise InputError(f"--out {out}: a specimen's grips are one file, NAME.safetensors")
+    began = perf_counter()
+    learned = learn_grips(
+        scene,
+        arguments.simulations or RUNS,
+        seed=arguments.seed or 0,
+        progress=not arguments.json,
+    )
+    learned.write(out)
+    degree, time = int(learned.degrees.sum(axis=1).max()), perf_counter() - began
+    text = (
+        f"learned what the grips of {scene.name} add: polynomials of degree {degree}, "
+        f"{100 * learned.error:.2g} % of a stress from FEM at held-out runs, {time:.0f} s\n"
+        f'written to {out}; next: learned = "{out.name}" under [grips] of the scene file'
+    )
+    content = {"out": str(out), "degree": degree, "error": learned.error, "seconds": time}
+    return Answer(content, text)
 
 
 def _training_summary(folder: str, scene: str, record: Mapping[str, Any]) -> str:

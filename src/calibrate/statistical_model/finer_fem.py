@@ -1,0 +1,141 @@
+"""FEM that is closer to what was measured: on a finer mesh, or of a specimen between its grips."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from calibrate.measurements import Observations
+from calibrate.measurements.outputs import on_finer
+from calibrate.statistical_model.model import Model
+from emulator.accuracy.mesh_error import MeshError, MeshErrorEstimate, mesh_error
+from emulator.fem import Simulator
+from emulator.fem.campaign import at_once
+from emulator.surrogates.gripped import GrippedSpecimen
+
+Known = Sequence[MeshErrorEstimate]
+
+
+class Finer(NamedTuple):
+    """Data (m,) without noise at one draw, all observations raveled.
+
+    fine : of the FEM that is closer to the measurement.
+    coarse : of the scene's own FEM.
+    estimates : the fields of which others may start.
+    """
+
+    fine: np.ndarray
+    coarse: np.ndarray
+    estimates: Known = ()
+
+
+class FinerFEM(Protocol):
+    """FEM that is closer to what was measured than a model's own."""
+
+    @property
+    def nodes(self) -> int:
+        """The number of nodes of its mesh."""
+        ...
+
+    @property
+    def workers(self) -> int:
+        """The number of draws that are solved at once."""
+        ...
+
+    def __call__(self, draw: Mapping[str, Any], known: Known = ()) -> Finer:
+        """Return the data at ``draw``; :class:`SolverError` where FEM does not converge.
+
+        known : fields of earlier draws, from which solves may start.
+        """
+        ...
+
+    def forget(self) -> None:
+        """Free what is kept between solves."""
+        ...
+
+
+def finer_fem(model: Model, simulator: Simulator) -> FinerFEM:
+    """Return the FEM that is closer to what was measured.
+
+    Raises
+    ------
+    InputError
+        There is none: a specimen without grips, a finer mesh that is too large, a load that it
+        cannot have, or an observation that says nothing of grips.
+    """
+    if simulator.scene.grips is not None:
+        return _Gripped(model, GrippedSpecimen(simulator.scene))
+    error = mesh_error(simulator)
+    return _OnFinerMesh(model, error, on_finer(error, model.observe))
+
+
+def _flat(observe: Observations, fields: Sequence[jax.Array], thetas: jax.Array) -> np.ndarray:
+    seen = jnp.stack([u[observe.nodes] for u in fields])
+    return np.asarray(ravel_pytree(observe(seen, thetas))[0])
+
+
+@dataclass(frozen=True, eq=False)
+class _OnFinerMesh:
+    """FEM on the next finer mesh; ``observe`` are the model's observations there."""
+
+    model: Model
+    error: MeshError
+    observe: Observations
+
+    @property
+    def nodes(self) -> int:
+        return len(self.error.finer.scene.mesh.nodes)
+
+    @property
+    def workers(self) -> int:
+        return at_once(self.error.simulator, self.nodes)
+
+    def __call__(self, draw: Mapping[str, Any], known: Known = ()) -> Finer:
+        """Return the data; solves start from ``known`` and from the draw's earlier states."""
+        thetas, own = self.model.states.thetas(draw), list[MeshErrorEstimate]()
+        for theta in thetas:
+            own.append(self.error(theta, self._start(theta), known=[*known, *own]))
+        fine = _flat(self.observe, [each.fine for each in own], thetas)
+        return Finer(fine, _flat(self.model.observe, [each.coarse for each in own], thetas), own)
+
+    @cached_property
+    def _start(self) -> Callable[[jax.Array], jax.Array]:
+        return jax.jit(self.model.full)
+
+    def forget(self) -> None:
+        self.error.forget()
+
+
+@dataclass(frozen=True, eq=False)
+class _Gripped:
+    """FEM of a specimen between its grips."""
+
+    model: Model
+    gripped: GrippedSpecimen
+
+    @property
+    def nodes(self) -> int:
+        return max(len(piece.mesh.nodes) for piece in self.gripped.simulators)
+
+    @property
+    def workers(self) -> int:
+        return self.gripped.workers
+
+    def __call__(self, draw: Mapping[str, Any], known: Known = ()) -> Finer:  # noqa: ARG002
+        """Return the data; what grips add is a share of the homogeneous stresses."""
+        (theta,) = self.model.states.thetas(draw)
+        solution = self.gripped.homogeneous.solve(theta).require_converged("the specimen")
+        fields, thetas = [solution.displacement], theta[None]
+        shares = self.gripped.shares(theta)
+        fine = _flat(self.model.observe.gripped(shares), fields, thetas)
+        return Finer(fine, _flat(self.model.observe, fields, thetas))
+
+    def forget(self) -> None:
+        """Do nothing: factors of a piece are small."""
