@@ -22,6 +22,12 @@ _MODULI = (0.005, 3.0)  # range of a modulus, as a share of the largest stress o
 _EXPONENTS = (0.1, 50.0)
 _KAPPA = 1000.0  # bulk modulus, likewise
 _NOISE = 0.03  # scale of both sds of the noise, as a share of the largest stress
+_GRIPS = (
+    "# [grips]   # how the piece was held, so that the certificate says what that does",
+    "# size = [10.0, 10.0, 1.0]   # mm between the grips along x, y and z",
+    '# held = "clamped"   # or "hooks"',
+    "# marks = 2.0   # mm, side of the square in which stretches were measured; not of the grips",
+)
 _LENGTH = 0.1  # over which errors along a curve correlate, in stretch
 
 
@@ -136,6 +142,7 @@ def _scene_text(law: Law, table: str, axes: list[str], slope: float) -> str:
             lines += ["", *_parameter(quantity, slope)]
     if any(quantity.name == "kappa" for quantity in law.quantities):
         lines += ["", "[constants]", f"kappa = {_KAPPA * slope:.2g}   # kPa"]
+    lines += ["", *_GRIPS]
     return "\n".join(lines) + "\n"
 
 

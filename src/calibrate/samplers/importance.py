@@ -43,6 +43,7 @@ from calibrate.samplers.diagnostics import (
 )
 from calibrate.samplers.nuts import NUTS, NUTSOptions
 from calibrate.samplers.proposals import (
+    MOST_TEMPERED,
     STEP,
     Kernels,
     WeightedPoints,
@@ -57,6 +58,7 @@ from emulator.core.display import counting
 from emulator.core.errors import SolverError
 
 _PRIOR = 1024  # draws of the prior that a population begins with
+_TEMPERED = 12.0  # effective points of a step, times the square of the number of unknowns
 _FOUND = 200.0  # effective points from which a proposal is fitted
 # Evaluations by which a population has found them, or is stuck: the time of its steps grows as
 # their square (docs/experiments.md, "Populations that are stuck").
@@ -109,6 +111,14 @@ class Population(WeightedPoints):
     def densities(self, z: np.ndarray) -> Heights:
         """Return log prior and log likelihood at points z (s, p)."""
         return heights(self.density, z, self.data)
+
+    @property
+    def most_tempered(self) -> float:
+        """The largest effective number of points that the kernels of a step are put on.
+
+        Steps contract faster with fewer; modes far apart are lost with too few.
+        """
+        return min(_TEMPERED * self.z.shape[1] ** 2, MOST_TEMPERED)
 
     @property
     def log_posterior(self) -> np.ndarray:
