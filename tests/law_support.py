@@ -28,6 +28,7 @@ ARGUMENTS = {
     "holzapfel_gasser_ogden": (3.0, 2.0, 2.5, 40.0, 25.0),
     "gasser_ogden_holzapfel": (3.0, 2.0, 2.5, 40.0, 0.1, 25.0),
     "may_newman": (0.5, 2.0, 8.0, 1.0, 25.0),
+    "invariant_terms": (1.0, 2.0, 0.5, 1.5, 2.5, 3.0, 4.0, 0.7, 3.5, 0.6, 2.2, 0.4, 25.0),
 }
 FIBRE = np.array([2.0, -1.0, 2.0]) / 3.0
 SHEET = np.array([2.0, 2.0, -1.0]) / 3.0

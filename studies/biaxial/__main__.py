@@ -201,6 +201,7 @@ def main() -> None:
     """Run the study."""
     words = parser(__doc__, HERE)
     words.add_argument("--sizes", nargs="+", type=float, default=SIZES, help="mm")
+    words.add_argument("--only", choices=("row", "coverage"), help="one of the two questions")
     arguments = words.parse_args()
     quick = arguments.quick
     results = Results(arguments.out, SEED, again=arguments.again, settings={"quick": quick})
@@ -211,6 +212,8 @@ def main() -> None:
         (f"coverage {k}", of_coverage, SIZES[1], k) for k in range(counts[1]) if SIZES[1] in sizes
     )
     for name, make, size, k in chain(of_covers, of_rows):
+        if arguments.only and not name.startswith(arguments.only):
+            continue
         results.case(name, lambda make=make, size=size, k=k: make(size, k, runs))
     found = summary(results.cases)
     results.write(summary=found)

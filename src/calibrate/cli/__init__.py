@@ -49,6 +49,7 @@ COMMANDS = {
     "sensitivity": "analyses",
     "serve": "serving",
     "simulate": "fem",
+    "terms": "analyses",
     "train": "train",
     "unload": "fem",
     "verify": "check",

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from numbers import Real
+from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, Self
 
 import jax
@@ -146,17 +147,21 @@ class Noise(ABC):
 
 
 def information_about_means(
-    noise: Mapping[str, Noise], means: Mapping[str, jax.Array]
+    noise: Mapping[str, Noise],
+    means: Mapping[str, jax.Array],
+    scales: Mapping[str, Mapping[str, jax.Array]] = MappingProxyType({}),
 ) -> jax.Array:
-    """Return the information (d, d) of data with known noises about their means.
+    """Return the information (d, d) of data about their means.
 
     It is the curvature of the log density at the mean, in the order of ``ravel_pytree``.
+
+    scales : the values of each noise's scales that are not known.
     """
     flat, unravel = ravel_pytree(means)
 
     def log_density(shifted: jax.Array) -> jax.Array:
         at = unravel(shifted)
-        terms = [noise[n].distribution(at[n], {}).log_prob(means[n]) for n in means]
+        terms = [noise[n].distribution(at[n], scales.get(n, {})).log_prob(means[n]) for n in means]
         return sum(terms, jnp.zeros(()))
 
     return -jax.hessian(log_density)(flat)

@@ -148,8 +148,10 @@ def _scene_text(law: Law, table: str, axes: list[str], slope: float) -> str:
 
 def _parameter(quantity: Quantity, slope: float) -> list[str]:
     low, high = (share * slope for share in _MODULI) if quantity.unit == "kPa" else _EXPONENTS
-    logarithmic = True
-    if np.isfinite(quantity.high) or quantity.low < 0.0:
+    logarithmic = not quantity.low_admitted
+    if quantity.low_admitted:
+        low = quantity.low
+    elif np.isfinite(quantity.high) or quantity.low < 0.0:
         logarithmic = False
         low, high = max(quantity.low, -20.0), min(quantity.high, 20.0)
         margin = 0.01 * (high - low)

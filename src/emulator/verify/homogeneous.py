@@ -201,6 +201,21 @@ def may_newman(stretches: np.ndarray, values: Values) -> np.ndarray:
     return stress + _volume(stretches, values["kappa"])
 
 
+def invariant_terms(stretches: np.ndarray, values: Values) -> np.ndarray:
+    """Fibres along x and sheets along y, which do not shear."""
+    x, d_x = _isochoric(stretches, np.ones(3))
+    I2, d_I2 = _isochoric(1.0 / stretches, np.ones(3))  # the second of F is the first of 1 / F
+    x, d_y = x - 3.0, -d_I2 / stretches**2
+    slope_x = values["I1"] / 2.0 + values["I1_2"] * x + values["I1_e"] / 2.0 * np.exp(10.0 * x)
+    stress = slope_x * d_x + (values["I2"] / 2.0 + values["I2_2"] * (I2 - 3.0)) * d_y
+    for k, direction in zip("fs", np.eye(3), strict=False):
+        measure, slope = _isochoric(stretches, direction)
+        z = max(measure - 1.0, 0.0)
+        steep = values[f"{k}_2"] * z + values.get(f"{k}_3", 0.0) * z**2
+        stress += (steep + values[f"{k}_e"] * z * np.exp(20.0 * z**2)) * slope
+    return stress + _volume(stretches, values["kappa"])
+
+
 _unswitched = partial(holzapfel_ogden, switch=False)
 _FIBRES = {"a": 2.0, "b": 3.0, "a_f": 5.0, "b_f": 4.0}
 _SHEETS = {"a_s": 3.0, "b_s": 4.0, "a_fs": 1.0, "b_fs": 2.0}
@@ -238,6 +253,24 @@ SOLUTIONS: dict[str, tuple[Callable[[np.ndarray, Values], np.ndarray], dict[str,
     "holzapfel_gasser_ogden": (two_families, {**_FAMILIES, "kappa": 25.0}),
     "gasser_ogden_holzapfel": (two_families, {**_FAMILIES, "dispersion": 0.1, "kappa": 25.0}),
     "may_newman": (may_newman, {"c_0": 0.5, "c_1": 2.0, "c_2": 8.0, **_MATRIX}),
+    "invariant_terms": (
+        invariant_terms,
+        {
+            "I1": 1.0,
+            "I1_2": 2.0,
+            "I1_e": 0.5,
+            "I2": 1.5,
+            "I2_2": 2.5,
+            "f_2": 3.0,
+            "f_3": 4.0,
+            "f_e": 0.7,
+            "s_2": 3.5,
+            "s_e": 0.6,
+            "fs_2": 2.2,
+            "fs_e": 0.4,
+            "kappa": 25.0,
+        },
+    ),
 }
 """Principal stresses of each law, and parameters, by which every term of the law contributes and
 volume changes are resisted as in tissue."""

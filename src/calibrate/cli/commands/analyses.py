@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from argparse import Namespace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -184,6 +185,24 @@ def _effects_in_words(recommendation: Recommendation) -> str:
         f"{selection.ratio:.2f} of the time"
     )
     return "\n".join(lines)
+
+
+@command(
+    run_options("seed"),
+    help="which terms of a law a test shows",
+    epilog="example: calibrate init biaxial.csv --law invariant_terms, then "
+    "calibrate terms biaxial.toml",
+)
+def terms(arguments: Namespace) -> Answer:
+    """Compare all sets of terms by their evidence."""
+    from calibrate.analysis.terms import find_terms
+    from calibrate.cli.run_words import problem_of
+    from calibrate.project.problem import build_model, with_data
+
+    found = find_terms(*build_model(with_data(problem_of(arguments))))
+    lines = [str(found), "likeliest sets:"]
+    lines += [f"  {chance:.3f}  {', '.join(names) or 'none'}" for names, chance in found.sets]
+    return Answer(asdict(found), "\n".join(lines))
 
 
 _SAMPLES = {"sobol": 512, "morris": 64, "derivatives": 256}

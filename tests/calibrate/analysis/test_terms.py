@@ -1,0 +1,161 @@
+"""Which terms a test shows: against quadrature, twins, terms that do the same, and refusals."""
+
+import json
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+import calibrate as cal
+import emulator as em
+from calibrate.analysis.terms import _compared, find_terms
+from calibrate.cli import main
+from emulator.core.errors import InputError
+from emulator.mechanics.laws.invariant_terms import TERMS
+from emulator.scenes.specimen import specimen, states
+
+PULL = np.linspace(1.02, 1.2, 8)
+HALF, STILL = 0.5 + 0.5 * PULL, np.ones(8)
+SHEAR, NONE = np.linspace(0.05, 0.4, 8), np.zeros(8)
+GIVEN = states(
+    {
+        "stretch_x": np.concatenate([PULL, PULL, HALF, STILL, STILL]),
+        "stretch_y": np.concatenate([PULL, HALF, PULL, STILL, STILL]),
+        "shear_xy": np.concatenate([NONE, NONE, NONE, SHEAR, NONE]),
+        "shear_xz": np.concatenate([NONE, NONE, NONE, NONE, SHEAR]),
+    },
+    [name for name in ("equal", "x", "y", "xy", "xz") for _ in range(8)],
+)
+
+
+def scene_of(given=GIVEN, scale="uniform"):
+    return specimen(
+        given,
+        law=em.find_law("invariant_terms"),
+        parameters=tuple(
+            em.Parameter(name, "kPa", 0.0 if scale == "uniform" else 0.1, 50.0, scale)
+            for name in TERMS
+        ),
+        constants={"kappa": 1000.0},
+        fibres=[1.0, 0.0, 0.0],
+        sheets=[0.0, 1.0, 0.0],
+    )
+
+
+def model_of(scene, noise=None, **options):
+    observe = cal.stresses(scene, "cauchy_x,cauchy_y,cauchy_xy,cauchy_xz")
+    noise = noise or cal.GaussianNoise(0.1)
+    forward = em.homogeneous(scene, incompressible=options.get("incompressible", True))
+    return cal.model(forward, {"stress": observe}, {"stress": noise})
+
+
+def test_probabilities_are_those_of_quadrature():
+    rng = np.random.default_rng(2)
+    G = np.column_stack([np.linspace(0.0, 1.0, 6), np.linspace(0.0, 1.0, 6) ** 2])
+    y = G @ [0.7, 0.4] + 0.1 * rng.normal(size=6)
+    found = _compared(G, y, ["one", "two"], ["one", "two"])
+    size = np.sqrt(np.mean(y**2))
+    sds, c = np.geomspace(1e-3 * size, size / 3.0, 400), np.linspace(0.0, 4.0, 801) + 0.0025
+    sums = {}
+    for S in [S for k in range(3) for S in combinations(range(2), k)]:
+        axes = [c if k in S else np.zeros(1) for k in range(2)]
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+        square, own = ((y - grid @ G.T) ** 2).sum(axis=1), list(S)
+        best = np.linalg.lstsq(G[:, own], y, rcond=None)[0] if S else np.zeros(0)
+        A = G[:, own].T @ G[:, own]
+        away = grid[:, own] - best
+        form = np.einsum("ci,ij,cj->c", away, A, away) if S else np.zeros(1)
+        sums[S] = (
+            0.25 ** len(S)
+            * 0.75 ** (2 - len(S))
+            * sum(
+                np.average(np.exp(-0.5 * square / sd**2), weights=np.exp(-0.5 * form / (6 * sd**2)))
+                / sd**6
+                for sd in sds
+            )
+        )
+    total = sum(sums.values())
+    for k, name in enumerate(("one", "two")):
+        exact = sum(value for S, value in sums.items() if k in S) / total
+        assert found.probabilities[name] == pytest.approx(exact, abs=0.03)
+
+
+@pytest.fixture(scope="module")
+def twins():
+    """A model of seven columns of data, and data of three terms with 3 % noise."""
+    model = model_of(scene_of())
+    moduli = dict.fromkeys(TERMS, 0.0) | {"I1": 8.0, "f_2": 20.0, "fs_2": 10.0}
+    theta = np.array([moduli[name] for name in TERMS])
+    exact = np.asarray(model.observe.parts["stress"](model.forward(theta), theta))
+    rng = np.random.default_rng(1)
+    return model, exact + 0.03 * np.sqrt(np.mean(exact**2)) * rng.normal(size=exact.shape)
+
+
+def test_terms_of_a_twin_are_found(twins):
+    model, data = twins
+    found = find_terms(model, data)
+    present = {name for name, chance in found.probabilities.items() if chance > 0.5}
+    assert present == {"I1", "f_2", "fs_2"}
+    assert found.moduli["f_2"][0] == pytest.approx(20.0, abs=4.0 * found.moduli["f_2"][1])
+    assert found.sets[0][0] == ("I1", "f_2", "fs_2")
+    assert found.noise == pytest.approx(0.3 * np.sqrt(np.mean(data**2)), rel=0.2)
+
+
+def test_terms_that_do_the_same_share_their_probability():
+    g = np.linspace(0.0, 1.0, 20)
+    y = 2.0 * g + 0.02 * np.random.default_rng(0).normal(size=20)
+    found = _compared(np.column_stack([g, 3.0 * g, g**3]), y, "abc", "abcd")
+    assert found.probabilities["a"] == pytest.approx(found.probabilities["b"], abs=1e-3)
+    assert 0.4 < found.probabilities["a"] < 0.8
+    assert found.probabilities["d"] == 0.25  # the data do not have it
+    assert {"a", "b", "d"} <= set(found.undecided)
+    assert "undecided" in str(found)
+
+
+def test_a_test_without_shear_says_nothing_of_shear():
+    rows = slice(24)
+    given = states({"stretch_x": GIVEN.gradients[rows, 0, 0] + 1.0,
+                    "stretch_y": GIVEN.gradients[rows, 1, 1] + 1.0}, ["a"] * 8 + ["b"] * 8
+                   + ["c"] * 8)  # fmt: skip
+    scene = scene_of(given)
+    observe = cal.stresses(scene, "cauchy_x,cauchy_y")
+    forward = em.homogeneous(scene, incompressible=True)
+    model = cal.model(
+        forward, {"stress": observe}, {"stress": cal.CorrelatedNoise(0.1, sd_scale=0.1,
+                                                                     spatial_sd_scale=0.1)}
+    )  # fmt: skip
+    theta = np.array([5.0 if name == "f_2" else 0.0 for name in TERMS])
+    data = np.asarray(observe(forward(theta), theta))
+    data = data + 0.05 * np.random.default_rng(3).normal(size=data.shape)
+    found = find_terms(model, data)
+    assert found.probabilities["fs_2"] == found.probabilities["fs_e"] == 0.25
+    assert found.probabilities["f_2"] + found.probabilities["f_3"] > 0.9
+
+
+def test_what_is_not_linear_is_refused():
+    uniaxial = states({"stretch_x": PULL, "stretch_y": np.full(8, np.nan)})
+    cases = [
+        (scene_of(uniaxial), None, "not linear in the moduli"),
+        (scene_of(scale="log"), None, "no modulus on a uniform scale"),
+        (scene_of(), cal.StudentTNoise(dof=4.0, scale=0.1), "must be Gaussian"),
+    ]
+    for scene, noise, words in cases:
+        model = model_of(scene, noise)
+        with pytest.raises(InputError, match=words):
+            find_terms(model, np.ones(model.observe.shapes["stress"]))
+
+
+def test_by_command(tmp_path, capsys, monkeypatch, twins):
+    monkeypatch.chdir(tmp_path)
+    _, data = twins
+    lines = ["protocol,stretch_x,stretch_y,shear_xy,shear_xz,cauchy_x,cauchy_y,cauchy_xy,cauchy_xz"]
+    names = [n for n in ("equal", "x", "y", "xy", "xz") for _ in range(8)]
+    for name, H, row in zip(names, GIVEN.gradients, data, strict=True):
+        motion = (1 + H[0, 0], 1 + H[1, 1], H[0, 1], H[0, 2])
+        lines.append(",".join([name, *(f"{x:.17g}" for x in (*motion, *row))]))
+    (tmp_path / "test.csv").write_text("\n".join(lines))
+    assert main(["init", "test.csv", "--law", "invariant_terms"]) == 0
+    capsys.readouterr()
+    assert main(["terms", "test.toml", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert max(found["probabilities"], key=found["probabilities"].get) in ("I1", "f_2", "fs_2")
