@@ -23,6 +23,7 @@ STUDIES = Path(__file__).parents[1] / "studies"
 QUICK = {
     "accuracy_vs_time": "--quick",
     "beam_coverage": "PUBLISHED --cases 2",
+    "biaxial": "--quick",
     "campaign": "--quick",
     "certificate": "--quick",
     "decoder_speed": "--quick",
@@ -55,6 +56,7 @@ QUICK = {
     "stability": "--workers 1 --cases theta_zero_inside_jit theta_too_short pushed_through_itself "
     "squeezed_to_half elements_10000_to_1 springs_1e12 twist_360_from_rest laplace_two_modes float32_once_clamped_beam "
     "outside_by_half_once_clamped_beam",
+    "terms": "--quick",
     "unloading": "--quick",
     "ventricle_family": "--quick",
     "verification": "--quick",

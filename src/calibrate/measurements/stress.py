@@ -183,9 +183,8 @@ class Stress(PointObservation):
     @classmethod
     def tables(cls, words: Collection[str]) -> dict[str, Table]:
         """Return the table of the columns of motions and stresses; of one each as an example."""
-        names = {word: with_unit(word)[0] for word in words}
-        given = [w for w, n in names.items() if _COMPONENT.fullmatch(n) or _PULL.fullmatch(n)]
-        areas = [w for w, n in names.items() if given and _AREA.fullmatch(n)]
+        given = [word for word in words if is_stress(word)]
+        areas = [w for w in words if given and _AREA.fullmatch(with_unit(w)[0])]
         columns = [*(motion_columns(words) or ["stretch_x"]), *(given or ["stress_x"]), *areas]
         return {cls.name: Table((), tuple(Field(word, (word,)) for word in columns))}
 
@@ -243,6 +242,12 @@ class Stress(PointObservation):
         moved = {word: x for word, x in arrays.items() if np.nan_to_num(x).any()}
         of_stress = dict(zip(self.components, values.reshape(len(values), -1).T, strict=True))
         return [(Field(word, (word,)), x) for word, x in {**moved, **of_stress}.items()]
+
+
+def is_stress(word: str) -> bool:
+    """Return whether a column has stresses, or forces that become some."""
+    name = with_unit(word)[0]
+    return bool(_COMPONENT.fullmatch(name) or _PULL.fullmatch(name))
 
 
 def _parts(component: str) -> tuple[str, int, int]:

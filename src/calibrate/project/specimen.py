@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calibrate.measurements.data import read_measurements
-from calibrate.measurements.stress import Stress
+from calibrate.measurements.stress import Stress, is_stress
 from emulator.core.cells import read_cells
 from emulator.core.errors import InputError
 from emulator.mechanics.laws import Law, find_law
@@ -16,7 +16,7 @@ from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.file import read_scene
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
-from emulator.scenes.specimen import AXES, States, read_states, specimen
+from emulator.scenes.specimen import AXES, States, read_states, specimen, with_unit
 
 _MODULI = (0.005, 3.0)  # range of a modulus, as a share of the largest stress over its strain
 _EXPONENTS = (0.1, 50.0)
@@ -83,6 +83,9 @@ def draft_specimen(table: str | Path, out: str | Path, *, law: str | None = None
         "too",
         f"errors along a curve correlate over {_LENGTH:g} of stretch, their sds are inferred",
     ]
+    bare = [w for w in read_cells(table).words if is_stress(w) and not with_unit(w)[1]]
+    if bare:
+        notes.insert(1, f"{', '.join(bare)} without a unit: kPa, forces mN; write {bare[0]} [MPa]")
     left_out = len(_every_row(table)) - len(given.free)
     if left_out:
         notes.insert(1, f"{left_out} rows of unloading are left out")

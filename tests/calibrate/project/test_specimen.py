@@ -7,9 +7,13 @@ import sys
 import numpy as np
 import pytest
 
+import calibrate as cal
+import emulator as em
+from calibrate.cli import main
 from calibrate.project.experiment import read_experiment
 from calibrate.project.specimen import draft_specimen
 from emulator.core.errors import InputError
+from emulator.scenes.file import read_scene
 
 A, B = 8.0, 6.0  # W = a (exp(b (I1 - 3)) - 1) / 2 b
 
@@ -93,3 +97,75 @@ def test_from_a_table_to_a_verdict(tmp_path):
     page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
     assert "way from the first state" in page
     assert "The body" not in page
+
+
+def test_stresses_without_a_unit_are_named(tmp_path):
+    (tmp_path / "test.csv").write_text(table().replace("stress_x [kPa]", "stress_x"))
+    notes = draft_specimen(tmp_path / "test.csv", tmp_path / "test.toml").notes
+    assert any("stress_x without a unit: kPa" in note for note in notes)
+
+
+GRIPPED = """law = "holzapfel_ogden_isotropic"
+specimen = "test.csv"
+grips = {size = [8.0, 4.0, 2.0], cells = 2}
+
+[parameters.a]
+unit = "kPa"
+range = [2.0, 20.0]
+
+[constants]
+b = 5.0
+kappa = 500.0
+"""
+
+
+@pytest.fixture
+def gripped(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "test.csv").write_text("stretch_x,stress_x [kPa]\n1,0\n1.05,2.1\n1.1,4.9\n")
+    (tmp_path / "scene.toml").write_text(GRIPPED)
+    return tmp_path
+
+
+def test_what_grips_do_is_learned_by_one_command(gripped, capsys):
+    assert main(["train", "scene.toml", "--out", "grips.safetensors", "--simulations", "10"]) == 0
+    assert 'learned = "grips.safetensors" under [grips]' in capsys.readouterr().out
+    text = GRIPPED.replace("cells = 2", 'cells = 2, learned = "grips.safetensors"')
+    (gripped / "scene.toml").write_text(text)
+    scene = read_scene(gripped / "scene.toml")
+    theta, forward = scene.centre, em.homogeneous(scene)
+    (data,) = (cal.stresses(scene, "stress_x")(forward(theta), theta),)
+    free = read_scene_without_grips(gripped)
+    even = cal.stresses(free, "stress_x")(forward(theta), theta)
+    assert float(data[0, 0]) == 0.0
+    assert 1.01 < float(data[-1, 0] / even[-1, 0]) < 1.3  # a clamped strip is stiffer
+
+
+def read_scene_without_grips(folder):
+    (folder / "free.toml").write_text(
+        "\n".join(GRIPPED.splitlines()[:2] + GRIPPED.splitlines()[3:])
+    )
+    return read_scene(folder / "free.toml")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("cells = 2", 'cells = 2, held = "glued"', "grips"),
+        ("size = [8.0, 4.0, 2.0]", "size = [8.0, 4.0]", "size"),
+        ("cells = 2", "marks = 9.0", "below that of the piece"),
+        ("cells = 2", 'learned = "none.safetensors"', "does not exist"),
+        ('specimen = "test.csv"', 'mesh = "body.msh"', "supports"),
+    ],
+)
+def test_bad_grips_get_one_line(gripped, capsys, old, new, words):
+    (gripped / "scene.toml").write_text(GRIPPED.replace(old, new))
+    assert main(["train", "scene.toml", "--out", "grips.safetensors"]) == 2
+    found = capsys.readouterr().err.strip()
+    assert words in found
+    assert len(found.splitlines()) == 1
+
+
+def test_a_folder_is_no_file_of_grips(gripped, capsys):
+    assert main(["train", "scene.toml", "--out", "grips"]) == 2
+    assert "NAME.safetensors" in capsys.readouterr().err
