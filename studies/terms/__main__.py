@@ -65,6 +65,7 @@ def examine(model: cal.Model, number: int, error: float) -> Case:
     exact = jax.jit(lambda theta: observe(forward(theta), theta))
     columns = np.stack([np.ravel(exact(row)) for row in np.eye(len(TERMS))])
     sizes = np.sqrt(np.mean(columns**2, axis=1))
+    sizes = np.where(sizes > 1e-9 * sizes.max(), sizes, 0.0)  # biaxial tests show no shear
     chosen = rng.choice(len(TERMS), rng.integers(2, 5), replace=False)
     moduli = np.zeros(len(TERMS))
     shares = rng.uniform(LEAST_SHARE, 1.0, len(chosen))

@@ -92,7 +92,8 @@ def moments(x: np.ndarray, weights: np.ndarray) -> np.ndarray:
     if not total > 0.0:
         p = x.shape[1]
         return np.full(2 * p + p * (p - 1) // 2, np.nan)
-    share = weights / total
+    used = weights > 0.0  # far away a scale may be infinite, which no weight of zero takes back
+    x, share = x[used], weights[used] / total
     mean = share @ x
     centred = x - mean
     covariance = (share[:, None] * centred).T @ centred

@@ -317,8 +317,13 @@ def _with_errors(name: str, figures: dict[str, Figure]) -> dict[str, dict[str, f
 
 
 def shifts(certificate: Mapping[str, Any]) -> dict[str, dict[str, float]]:
-    """Return the shifts of means by FEM and by a finer mesh, in sd, from a certificate's JSON."""
-    by_cause = {"FEM": certificate.get("shift"), "mesh": certificate.get("mesh", {}).get("shift")}
+    """Return the shifts of means by FEM and by a finer mesh, in sd, from a certificate's JSON.
+
+    A specimen has ``grips`` in place of ``mesh``.
+    """
+    mesh = certificate.get("mesh", {})
+    finer = "grips" if mesh.get("gripped") else "mesh"
+    by_cause = {"FEM": certificate.get("shift"), finer: mesh.get("shift")}
     return {cause: shift for cause, shift in by_cause.items() if shift}
 
 

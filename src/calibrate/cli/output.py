@@ -70,7 +70,9 @@ def posterior_summary(report: Mapping[str, Any]) -> str:
         rows.append((name, *cells, *(shift.get(name) for shift in shifts_by_judge.values())))
     lines = [table(("parameter", *titles, *(f"{judge}/sd" for judge in shifts_by_judge)), rows)]
     if shifts_by_judge:
-        lines.append("FEM, mesh: how far FEM, and a finer mesh, would move each mean, in sd")
+        finer = "FEM between the grips" if "grips" in shifts_by_judge else "a finer mesh"
+        judges = ", ".join(shifts_by_judge)
+        lines.append(f"{judges}: how far FEM, and {finer}, would move each mean, in sd")
     lines.append(
         f"{report['chains']} chains x {report['draws']} draws, {report['divergences']} divergences"
         f", forward map: {report['forward']}"

@@ -156,7 +156,8 @@ def _parameter(quantity: Quantity, slope: float) -> list[str]:
         low = quantity.low
     elif np.isfinite(quantity.high) or quantity.low < 0.0:
         logarithmic = False
-        low, high = max(quantity.low, -20.0), min(quantity.high, 20.0)
+        low = quantity.low if np.isfinite(quantity.low) else -20.0
+        high = quantity.high if np.isfinite(quantity.high) else 20.0
         margin = 0.01 * (high - low)
         low, high = low + margin, high - margin
     return [

@@ -25,7 +25,11 @@ from calibrate.report.parts import Verdict
 from emulator.core.store import read_json, replacing
 from emulator.scenes.specimen import is_specimen
 
-_SHIFTS = {"FEM": "by FEM / sd", "mesh": "on a finer mesh / sd"}
+_SHIFTS = {
+    "FEM": "by FEM / sd",
+    "mesh": "on a finer mesh / sd",
+    "grips": "between its grips / sd",
+}
 
 
 def write_page(folder: str | Path, out: str | Path | None, *, fem: bool) -> Path:
@@ -103,14 +107,15 @@ def _verdict(
 
 def _basis(certificate: dict[str, Any]) -> Iterator[str]:
     """Yield the sentences that say what a verdict rests on, and its limits."""
-    finer = (certificate.get("mesh") or {}).get("runs", 0)
+    mesh = certificate.get("mesh") or {}
+    where = "between the grips" if mesh.get("gripped") else "on a finer mesh"
     runs = f"Judged by {certificate['draws']} FEM runs, {certificate['failed']} failed"
-    yield f"{runs}, and {finer} on a finer mesh." if finer else f"{runs}."
+    yield f"{runs}, and {mesh['runs']} {where}." if mesh.get("runs") else f"{runs}."
     k, most = certificate["k_hat"], certificate["k_threshold"]
     if k is not None and most is not None:
         yield f"Pareto k {k:.2f}, at most {most:.2f}."
     yield (
-        f"Limits: {LARGEST_SHIFT:g} sd for a mean, {LARGEST_MESH_SHIFT:g} on a finer mesh, "
+        f"Limits: {LARGEST_SHIFT:g} sd for a mean, {LARGEST_MESH_SHIFT:g} {where}, "
         f"{100.0 * math.expm1(LARGEST_LOG_SD):.0f} % for an sd."
     )
 

@@ -38,6 +38,11 @@ def test_moments_of_weighted_points():
     np.testing.assert_allclose(moments(x, 7.0 * weights), expected, rtol=1e-14)
 
 
+def test_points_without_weight_are_not_read():
+    x, weights = np.array([[1.0], [3.0], [np.inf]]), np.array([1.0, 1.0, 0.0])
+    np.testing.assert_allclose(moments(x, weights), [2.0, 0.0], atol=1e-12)
+
+
 def test_nothing_has_no_moments():
     assert np.isnan(moments(np.ones((4, 2)), np.zeros(4))).all()
 
