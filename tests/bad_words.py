@@ -4,6 +4,10 @@ Words as in a shell.
 """
 
 COMMANDS = [
+    (
+        "terms once_clamped_beam --observe nodes:8 --noise 0.2 --truth mu=70 lam=80",
+        "'mu' is no modulus on a uniform scale",
+    ),
     ("mesh --endocardium none.stl --epicardium no.stl --out lv.vtu", "none.stl does not exist"),
     ("mesh --endocardium none.stl", "arguments are required: --epicardium, --out"),
     (

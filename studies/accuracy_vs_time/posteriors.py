@@ -126,6 +126,7 @@ def examine(name: str) -> Case:
         after = {
             "certifying_s": time.perf_counter() - began - sampling,
             "verdict": certificate.verdict,
+            "reason": certificate.reason,
         }
     names = scene.parameter_names
     columns = np.column_stack([draws[each] for each in names])

@@ -15,6 +15,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from calibrate.cli import COMMANDS, build_parser
+from calibrate.project.specimen import draft_specimen
 from cli_support import write_block
 from surface_support import INSIDE, OUTSIDE, ellipsoid, write
 
@@ -46,6 +47,7 @@ WORDS = [
     "sensitivity once_clamped_beam --observe nodes:4 --samples 8",
     "serve once_clamped_beam --port 0",
     "simulate scene.toml --theta mu=7",
+    "terms tests.toml",
     "train scene.toml --recipe mechanics --simulations 4 --out emulator",
     "unload scene.toml --theta mu=7 --out rest",
     "verify patch",
@@ -82,6 +84,11 @@ def folder(tmp_path_factory):
     """A scene with its mesh, two surfaces, and two posteriors of the same data."""
     found = tmp_path_factory.mktemp("commands")
     write_block(found)
+    rows = (f"{x},{y},{9 * (x - 1):.3f},{7 * (y - 1):.3f}" for x in (1.1, 1.2) for y in (1.1, 1.2))
+    table = "stretch_x,stretch_y,stress_x [kPa],stress_y [kPa],protocol\n"
+    lines = (f"{row},{k}\n" for k, row in enumerate(rows))
+    (found / "tests.csv").write_text(table + "".join(lines))
+    draft_specimen(found / "tests.csv", found / "tests.toml", law="invariant_terms")
     write(found / "endo.stl", ellipsoid(INSIDE))
     write(found / "epi.stl", ellipsoid(OUTSIDE))
     for name in ("one", "two"):
