@@ -89,6 +89,8 @@ class Stress(PointObservation):
                     f"stress '{component}' is unknown; give stress, cauchy or second with its "
                     "plane, such as stress_x or stress_xy"
                 )
+        if self.scene.grips is not None and self.scene.grips.learned is not None:
+            self._check_grips(self.scene.grips.learned.shares[0])
         self._derive(nodes=all_nodes(self.scene))
 
     @classmethod
@@ -148,13 +150,17 @@ class Stress(PointObservation):
 
         :class:`InputError` where a component acts on no grip.
         """
+        self._check_grips(shares)
+        part = copy(self)  # with the entries that are not missing
+        part._derive(shares=jnp.asarray(np.nan_to_num(shares)))
+        return part
+
+    def _check_grips(self, shares: np.ndarray) -> None:
+        """Refuse components of which grips say nothing: all their shares are NaN."""
         for component in self.components:
             _, row, column = _parts(component)
             if np.isnan(shares[:, row, column]).all():
                 raise InputError(f"'{component}' acts on no grip of the piece")
-        part = copy(self)  # with the entries that are not missing
-        part._derive(shares=jnp.asarray(np.nan_to_num(shares)))
-        return part
 
     def rows(self) -> tuple[str, np.ndarray]:
         """Return the numbers of the states."""

@@ -46,7 +46,7 @@ class Piece:
     specimen : the scene of its homogeneous states.
     grips : how it was held.
     faces : the axes whose upper face is moved.
-    moved : the components (i, j) of displacements i of faces j that vary.
+    moved : the components (i, j): faces normal to j are displaced along i.
     largest : the largest of each of ``moved`` in any state, without sign.
     """
 
@@ -60,7 +60,8 @@ class Piece:
         if self.grips.held == "clamped" and len(self.faces) > 1:
             axes = " and ".join(AXES[j] for j in self.faces)
             raise InputError(
-                f"grips: faces clamped along {axes} would tear at their common edges; held by hooks"
+                f"grips: faces clamped along {axes} would tear at their common edges; give held = "
+                '"hooks"'
             )
 
     @property
@@ -257,14 +258,14 @@ def pieces(specimen: Scene) -> dict[str, Piece]:
 def _faces(
     given: States, rows: Sequence[int] | np.ndarray, grips: Grips
 ) -> tuple[tuple[int, ...], tuple[tuple[int, int], ...]]:
-    """Return the axes whose faces a test moves, and the components that vary."""
+    """Return the axes whose faces a test moves, and the components (i, j) of the displacements."""
     H, free = given.gradients[rows], given.free[rows].any(axis=0)
-    varies = np.abs(H).max(axis=0) > _ROUND_OFF
-    sheared = [j for j in range(3) if varies[:, j].sum() - varies[j, j] > 0]
+    moves = np.abs(H).max(axis=0) > _ROUND_OFF
+    sheared = [j for j in range(3) if moves[:, j].sum() - moves[j, j] > 0]
     if sheared and grips.held == "hooks":
         raise InputError("grips: hooks do not shear a piece; plates do, held = clamped")
     # A stretch that stays 1 is one that hooks hold, or that the width of a clamped piece keeps.
-    driven = [j for j in range(3) if not free[j] and (varies[j, j] or grips.held == "hooks")]
+    driven = [j for j in range(3) if not free[j] and (moves[j, j] or grips.held == "hooks")]
     axes = tuple(sheared or driven)
     if not axes:
         raise InputError("grips: a test moves no face of the piece")
@@ -274,6 +275,6 @@ def _faces(
         (i, j)
         for j in axes
         for i in range(3)
-        if (varies[i, j] if i != j else not free[j] and (varies[j, j] or grips.held == "hooks"))
+        if (moves[i, j] if i != j else not free[j] and (moves[j, j] or grips.held == "hooks"))
     )
     return axes, moved
