@@ -48,6 +48,7 @@ _UNLIKELY = 9.0  # log evidence below the best from which a set is left out
 _LISTED = 5  # sets that are told
 _RIDGE = 1e-8  # of columns of length 1: two may be the same
 _FAR = 8.0  # sds from zero at which a modulus is positive
+_HOPELESS = -12.0  # log probability below which the integral is not asked
 _LINEAR = 1e-6  # share of the data by which a linear map may miss the forward map
 
 
@@ -163,9 +164,15 @@ def _compared(G: np.ndarray, y: np.ndarray, names: Sequence[str], every: Sequenc
         """Return the log evidence (sets, sds), ``-inf`` where it is hopeless."""
         logs = 0.5 * (fits[:, None] - np.sum(y**2)) / sds**2 - len(y) * np.log(sds)
         logs += (prior - 0.5 * counts * np.log1p(len(y)))[:, None]
-        found = np.full_like(logs, -np.inf)
-        for i, j in np.argwhere(logs > logs.max() - _UNLIKELY):
+        # The likeliest sets of moduli of any sign may need negative ones: the best is known last.
+        found, best = np.full_like(logs, -np.inf), -np.inf
+        most = logs + counts[:, None] * np.log(2.0)
+        for place in np.argsort(-most, axis=None):
+            i, j = np.unravel_index(place, logs.shape)
+            if most[i, j] < best - _UNLIKELY:
+                break
             found[i, j] = logs[i, j] + least_squares.log_positive(sets[i], sds[j])
+            best = max(best, found[i, j])
         return found
 
     coarse = np.geomspace(1e-3 * size, size / 3.0, _NOISES)
@@ -220,15 +227,17 @@ class _LeastSquares:
 
 
 def _log_orthant(mean: np.ndarray, covariance: np.ndarray) -> float:
-    """Return the log probability that a normal vector (k,) is positive."""
-    near = mean < _FAR * np.sqrt(np.diag(covariance))  # the others are positive
-    if not near.any():
-        return 0.0
-    if near.sum() == 1:
-        return float(log_ndtr(mean[near] / np.sqrt(covariance[near, near]))[0])
+    """Return the log probability that a normal vector (k,) is positive.
+
+    It is no more than that of each entry, which is exact where the integral's own error is larger.
+    """
+    far = mean / np.sqrt(np.diag(covariance))
+    near, bound = far < _FAR, float(log_ndtr(far).min())  # the others are positive
+    if near.sum() <= 1 or bound < _HOPELESS:
+        return bound
     block = covariance[np.ix_(near, near)]
     chance = multivariate_normal.cdf(mean[near], mean=np.zeros(int(near.sum())), cov=block, rng=0)
-    return float(np.log(max(float(chance), 1e-300)))
+    return min(float(np.log(max(float(chance), 1e-300))), bound)
 
 
 def _moments(

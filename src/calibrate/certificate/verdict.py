@@ -150,7 +150,7 @@ class MeshChange(Changes):
 
     @property
     def place(self) -> str:
-        """Where the solves are, in words."""
+        """The place of the solves in words."""
         where = "between its grips" if self.gripped else "on a finer mesh"
         return f"{where} ({self.nodes} nodes)"
 

@@ -1,8 +1,8 @@
 r"""Stresses of a specimen: the curves of a tensile, biaxial or shear test.
 
-From the first Piola-Kirchhoff stress P of a state of gradient F
-(:func:`~emulator.surrogates.homogeneous.homogeneous_stresses`), and what grips add to it
-(:mod:`emulator.surrogates.gripped`), follow
+All measures follow from the first Piola-Kirchhoff stress P of a state of gradient F
+(:func:`~emulator.surrogates.homogeneous.homogeneous_stresses`) with what grips add to it
+(:mod:`emulator.surrogates.gripped`),
 
 .. math:: \sigma = P F^T / J, \qquad S = F^{-1} P .
 

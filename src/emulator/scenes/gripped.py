@@ -95,7 +95,7 @@ class Piece:
 
     @property
     def acting(self) -> np.ndarray:
-        """Whether a force i acts on the face normal to j, (3, 3)."""
+        """The forces i that act on the face normal to j, a mask (3, 3)."""
         on_faces = np.isin(np.arange(3), self.faces)
         return on_faces & (np.eye(3, dtype=bool) | (self.grips.held == "clamped"))
 

@@ -112,6 +112,15 @@ def test_terms_that_do_the_same_share_their_probability():
     assert "undecided" in str(found)
 
 
+def test_a_set_that_needs_a_negative_modulus_is_not_taken():
+    g = np.linspace(0.1, 1.0, 30)
+    y = 2.0 * g - 0.8 * g**3 + 0.005 * np.random.default_rng(4).normal(size=30)
+    found = _compared(np.column_stack([g, g**3, g**0.5]), y, "abc", "abc")
+    assert found.probabilities["b"] < 0.1
+    assert min(mean for name, (mean, _) in found.moduli.items() if name != "b") > 0.0
+    assert found.probabilities["a"] > 0.99
+
+
 def test_a_test_without_shear_says_nothing_of_shear():
     rows = slice(24)
     given = states({"stretch_x": GIVEN.gradients[rows, 0, 0] + 1.0,
