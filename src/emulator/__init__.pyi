@@ -22,6 +22,7 @@ from .scenes import Parameter, Scene, Support, loads, supports
 from .scenes.draft import draft_scene
 from .scenes.finer import finer
 from .scenes.specimen import specimen
+from .scenes.tube import Tube
 from .surrogates import Emulator, load, save_emulator, shipped
 from .surrogates.corrected import corrected
 from .surrogates.fem import FEMForward, fem_forward
@@ -53,6 +54,7 @@ __all__ = [
     "SolverError",
     "Status",
     "Support",
+    "Tube",
     "Unloaded",
     "Unloader",
     "boundary_facets",

@@ -23,7 +23,8 @@ import emulator as em
 from calibrate.figures import BLUE, ORANGE, pyplot
 from emulator.fem.campaign.designs import sobol
 from emulator.scenes.grips import Grips, Learned
-from emulator.scenes.specimen import specimen, states
+from emulator.scenes.specimen import specimen
+from emulator.scenes.states import states
 from emulator.surrogates.gripped import GrippedSpecimen, learn_grips
 
 HERE = Path(__file__).parent

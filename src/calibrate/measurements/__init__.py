@@ -43,6 +43,7 @@ from calibrate.measurements.surface import (
     surface_distances,
     surface_points,
 )
+from calibrate.measurements.tube import TubeForce, TubePressure
 from calibrate.measurements.volume import CavityVolume
 from calibrate.state_names import in_state, split
 from emulator.core.errors import InputError, look_up
@@ -63,6 +64,8 @@ OBSERVATIONS: dict[str, type[Observation]] = {
         Length,
         Reaction,
         Stress,
+        TubePressure,
+        TubeForce,
         MeasuredParameter,
     )
 }
@@ -80,6 +83,8 @@ __all__ = [
     "Reaction",
     "Scalar",
     "Stress",
+    "TubeForce",
+    "TubePressure",
     "landmarks",
     "leave_out_missing",
     "length_between",

@@ -121,9 +121,9 @@ class PointObservation(Observation):
         """
         kind, _, rest = word.partition(":")
         if cls.spread is None:
-            if not rest:
+            if bool(rest) is not bool(cls.arguments):
                 raise cls.misuse(word)
-            return cls.name, cls.of(scene, rest)
+            return cls.name, cls.of(scene, *filter(None, [rest]))
         *selection, number = rest.rsplit(":", 1) if len(cls.arguments) > 1 else [rest]
         if not rest or len(selection) + 1 < len(cls.arguments) or not all(selection):
             raise cls.misuse(word)
@@ -145,8 +145,9 @@ class PointObservation(Observation):
     @classmethod
     def from_json(cls, scene: Scene, description: Mapping[str, Any]) -> Self:
         """Return the observation with these arguments and entries."""
-        *selection, places = (description[argument] for argument in cls.arguments)
-        whole = cls.of(scene, *selection, np.asarray(places))
+        arguments = [description[argument] for argument in cls.arguments]
+        places = [np.asarray(each) for each in arguments[-1:]]
+        whole = cls.of(scene, *arguments[:-1], *places)
         entries = description.get(_ENTRIES)
         return whole if entries is None else whole.restricted(np.asarray(entries))
 

@@ -26,7 +26,6 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Self
 
 import jax
@@ -34,27 +33,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibrate.measurements.observation import Block, Field, Table
-from calibrate.measurements.points import PointObservation
-from calibrate.noise.protocol import Sites
+from calibrate.measurements.specimens import IN_KPA, IN_MN, SpecimenCurves, factor
 from emulator.core.errors import InputError
 from emulator.mechanics.kinematics import cofactor, determinant
-from emulator.scenes.scene import Scene, all_nodes
-from emulator.scenes.specimen import AXES, motion_columns, states, states_of, with_unit
+from emulator.scenes.scene import Scene
+from emulator.scenes.states import AXES, motion_columns, with_unit
 from emulator.surrogates.gripped import added, gripped_stresses
 from emulator.surrogates.homogeneous import homogeneous_stresses
 
 _COMPONENT = re.compile(r"(stress|cauchy|second)_([xyz])([xyz])?")
 _PULL = re.compile(r"force(_[xyz][xyz]?)")
 _AREA = re.compile(r"area(_[xyz][xyz]?)")
-_IN_KPA = {"kPa": 1.0, "Pa": 1e-3, "MPa": 1e3, "mmHg": 0.13332239, "g/cm2": 0.0980665}
-_IN_MN = {"mN": 1.0, "N": 1e3, "g": 9.80665, "gf": 9.80665, "kN": 1e6}
 _IN_MM2 = {"mm2": 1.0, "cm2": 100.0, "m2": 1e6}
-_APART = 1e3  # distance between the sites of two tests, whose errors do not correlate
-_ROUND_OFF = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Stress(PointObservation):
+class Stress(SpecimenCurves):
     """Stresses (d, c) of ``components`` (c) in the d states of a specimen, in kPa.
 
     :class:`InputError` for a scene that is no specimen, or an unknown component.
@@ -76,13 +70,15 @@ class Stress(PointObservation):
     quantity = "stress"
     unit = "kPa"
     other_units = {"MPa": 1e3, "Pa": 1e-3, "mmHg": 0.13332239}
-    place_field = Field("motion", ("stretch_x",), where=True)
     value_fields = (Field("stress_x", ("stress_x",)),)
-    constants = {"stretch": "stretches"}
-    curve_axis = "way from the first state of each test, in stretch"
 
     def __post_init__(self) -> None:
-        states_of(self.scene)  # refuses what is no specimen
+        super().__post_init__()
+        if self.scene.tube is not None:
+            raise InputError(
+                f"scene '{self.scene.name}' is a tube, whose stresses are measured by pressure and "
+                "force_axial"
+            )
         for component in self.components:
             if _COMPONENT.fullmatch(component) is None:
                 raise InputError(
@@ -91,59 +87,12 @@ class Stress(PointObservation):
                 )
         if self.scene.grips is not None and self.scene.grips.learned is not None:
             self._check_grips(self.scene.grips.learned.shares[0])
-        self._derive(nodes=all_nodes(self.scene))
 
     @classmethod
     def of(cls, scene: Scene, components: str | Sequence[str]) -> Self:
         """Return the observation of ``components``, as text joined by commas."""
         texts = components.split(",") if isinstance(components, str) else components
         return cls(scene, tuple(str(text) for text in texts))
-
-    @property
-    def _full_shape(self) -> tuple[int, ...]:
-        return len(self.scene.mesh.elements), len(self.components)
-
-    @cached_property
-    def stretches(self) -> np.ndarray:
-        """The prescribed stretches of the states along x, y and z, (d, 3); NaN where free."""
-        given = states_of(self.scene)
-        return np.where(given.free, np.nan, 1.0 + np.diagonal(given.gradients, axis1=1, axis2=2))
-
-    @cached_property
-    def tests(self) -> Mapping[str, np.ndarray]:
-        """The states (k,) of each test by its name; one without a name where none has any."""
-        return states_of(self.scene).protocols
-
-    @cached_property
-    def paths(self) -> np.ndarray:
-        """The way of each state from the first of its test, in stretch, and the test's place."""
-        given = states_of(self.scene)
-        paths = np.zeros((len(given.free), 3))
-        paths[:, 0] = given.paths
-        for number, rows in enumerate(self.tests.values()):
-            paths[rows, 1] = _APART * number
-        return paths
-
-    @property
-    def sites(self) -> Sites:
-        """The way along each test in stretch, so that errors correlate along its curve."""
-        sites = Sites.of(self.paths, len(self.components))
-        return sites if self.entries is None else Sites(*(each[self.entries] for each in sites))
-
-    @property
-    def curves(self) -> Mapping[str, tuple[np.ndarray, np.ndarray]]:
-        """The curve of each test and component, over the way in stretch."""
-        every = np.arange(len(self.stretches) * len(self.components))
-        states, components = np.divmod(
-            every if self.entries is None else self.entries, len(self.components)
-        )
-        found = {}
-        for test, rows in self.tests.items():
-            for c, component in enumerate(self.components):
-                own = np.flatnonzero(np.isin(states, rows) & (components == c))
-                if len(own):
-                    found[f"{test} {component}".strip()] = self.paths[states[own], 0], own
-        return found
 
     def gripped(self, shares: np.ndarray) -> Self:
         """Return the same stresses with what grips add, (d, 3, 3) as shares of a state's stress.
@@ -162,15 +111,7 @@ class Stress(PointObservation):
             if np.isnan(shares[:, row, column]).all():
                 raise InputError(f"'{component}' acts on no grip of the piece")
 
-    def rows(self) -> tuple[str, np.ndarray]:
-        """Return the numbers of the states."""
-        return "state", np.arange(len(self.stretches))
-
-    def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
-        """Return stresses (..., d, c) in kPa."""
-        return jnp.vectorize(self._stresses, signature="(k,i),(p)->(d,c)")(displacement, theta)
-
-    def _stresses(self, u: jax.Array, theta: jax.Array) -> jax.Array:
+    def _measured(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         H, P = homogeneous_stresses(self.scene, u, theta)
         P = gripped_stresses(self.scene, P, theta) if self.shares is None else added(P, self.shares)
         return jax.vmap(self._components)(H, P)
@@ -199,21 +140,9 @@ class Stress(PointObservation):
         cls, scene: Scene, name: str, table: Table, arrays: Mapping[str, np.ndarray]
     ) -> tuple[Self, np.ndarray]:
         """Return the observation and its data in kPa, of the states that the scene has."""
-        expected = states_of(scene)
-        found = states({w: arrays[w] for w in motion_columns(arrays)}, ordered=False)
-        if len(found.free) != len(expected.free):
-            raise InputError(
-                f"{len(found.free)} rows say how the specimen moves; scene '{scene.name}' has "
-                f"{len(expected.free)} states"
-            )
-        same = np.abs(found.gradients - expected.gradients).max(axis=(1, 2)) <= _ROUND_OFF
-        other = np.flatnonzero(~same | (found.free != expected.free).any(axis=1))
-        if len(other):
-            raise InputError(
-                f"row {other[0] + 1} moves otherwise than the state of scene '{scene.name}'"
-            )
         columns = _in_kpa(arrays)
-        part = cls(scene, tuple(columns))
+        motions = {w: arrays[w] for w in motion_columns(arrays)}
+        part = cls(scene, tuple(columns)).check_motion(motions)
         values = np.column_stack(list(columns.values()))
         part._check_signs(values)
         return part, values
@@ -223,7 +152,7 @@ class Stress(PointObservation):
 
         One that moves less than a third of the largest may contract while it is pulled.
         """
-        gradients = states_of(self.scene).gradients
+        gradients = self.states.gradients
         driven = np.abs(gradients).max() / 3.0
         for k, component in enumerate(self.components):
             _, row, column = _parts(component)
@@ -237,17 +166,8 @@ class Stress(PointObservation):
 
     def block(self, name: str, values: np.ndarray) -> Block:
         """Return the motion of each state, and the stresses."""
-        given = states_of(self.scene)
-        arrays = {f"stretch_{a}": self.stretches[:, k] for k, a in enumerate(AXES)}
-        arrays |= {
-            f"shear_{a}{b}": given.gradients[:, i, j]
-            for i, a in enumerate(AXES)
-            for j, b in enumerate(AXES)
-            if i != j
-        }
-        moved = {word: x for word, x in arrays.items() if np.nan_to_num(x).any()}
-        of_stress = dict(zip(self.components, values.reshape(len(values), -1).T, strict=True))
-        return [(Field(word, (word,)), x) for word, x in {**moved, **of_stress}.items()]
+        of_stress = zip(self.components, values.reshape(len(values), -1).T, strict=True)
+        return [*self.motion(), *((Field(word, (word,)), x) for word, x in of_stress)]
 
 
 def is_stress(word: str) -> bool:
@@ -270,26 +190,18 @@ def _in_kpa(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     for word, values in arrays.items():
         name, unit = with_unit(word)
         if (found := _AREA.fullmatch(name)) is not None:
-            areas[found[1]] = values * _factor(word, unit, "mm2", _IN_MM2)
+            areas[found[1]] = values * factor(word, unit, "mm2", _IN_MM2)
     for word, values in arrays.items():
         name, unit = with_unit(word)
         if _COMPONENT.fullmatch(name) is not None:
-            columns[name] = values * _factor(word, unit, "kPa", _IN_KPA)
+            columns[name] = values * factor(word, unit, "kPa", IN_KPA)
         elif (found := _PULL.fullmatch(name)) is not None:
             if (area := areas.get(found[1])) is None:
                 raise InputError(
                     f"column '{word}' is a force; give the area at rest as well, 'area{found[1]}'"
                 )
-            columns[f"stress{found[1]}"] = values * _factor(word, unit, "mN", _IN_MN) / area
+            columns[f"stress{found[1]}"] = values * factor(word, unit, "mN", IN_MN) / area
     return columns
-
-
-def _factor(word: str, unit: str, usual: str, known: Mapping[str, float]) -> float:
-    """Return the factor from a column's unit, ``usual`` where it has none."""
-    plain = unit.replace("²", "2").replace("^", "") or usual
-    if plain not in known:
-        raise InputError(f"column '{word}': unit '{unit}' is unknown; one of {', '.join(known)}")
-    return known[plain]
 
 
 stresses = Stress.of

@@ -9,6 +9,7 @@ import numpy as np
 
 from calibrate.measurements.data import read_measurements
 from calibrate.measurements.stress import Stress, is_stress
+from calibrate.measurements.tube import TubeForce, TubePressure
 from emulator.core.cells import read_cells
 from emulator.core.errors import InputError
 from emulator.mechanics.laws import Law, find_law
@@ -16,11 +17,14 @@ from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.file import read_scene
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
-from emulator.scenes.specimen import AXES, States, read_states, specimen, with_unit
+from emulator.scenes.specimen import measured_states, read_states, specimen
+from emulator.scenes.states import AXES, States, with_unit
+from emulator.scenes.tube import Tube
 
 _MODULI = (0.005, 3.0)  # range of a modulus, as a share of the largest stress over its strain
 _EXPONENTS = (0.1, 50.0)
 _KAPPA = 1000.0  # bulk modulus, likewise
+_KAPPA_OF_WALL = 1e4  # of a tube, where fibres are stretched most: 1000 changes stresses by 0.4 %
 _NOISE = 0.03  # scale of both sds of the noise, as a share of the largest stress
 _GRIPS = (
     "# [grips]   # how the piece was held, so that the certificate says what that does",
@@ -28,6 +32,7 @@ _GRIPS = (
     '# held = "clamped"   # or "hooks"',
     "# marks = 2.0   # mm, side of the square in which stretches were measured; not of the grips",
 )
+_STRESSES = (Stress.kind, TubePressure.kind, TubeForce.kind)
 _LENGTH = 0.1  # over which errors along a curve correlate, in stretch
 
 
@@ -45,16 +50,20 @@ class SpecimenDraft(NamedTuple):
     notes: tuple[str, ...]
 
 
-def draft_specimen(table: str | Path, out: str | Path, *, law: str | None = None) -> SpecimenDraft:
+def draft_specimen(
+    table: str | Path, out: str | Path, *, law: str | None = None, tube: Tube | None = None
+) -> SpecimenDraft:
     """Write a scene file and an experiment file for a table of a specimen's test.
 
     Parameters
     ----------
-    table : a CSV file or spreadsheet, see :mod:`emulator.scenes.specimen` and
-        :mod:`calibrate.measurements.stress` for its columns.
+    table : a CSV file or spreadsheet, see :mod:`emulator.scenes.states` and
+        :mod:`calibrate.measurements.stress` for its columns, and :mod:`emulator.scenes.tube` and
+        :mod:`calibrate.measurements.tube` for those of a tube.
     out : the experiment file, ``NAME.toml``; the scene is ``NAME_scene.toml`` beside it.
     law : name of the law; by default two families of fibres for tests that pull along two axes,
         an isotropic exponential else.
+    tube : the sector of a tube.
 
     Raises
     ------
@@ -70,30 +79,34 @@ def draft_specimen(table: str | Path, out: str | Path, *, law: str | None = None
             raise InputError(f"{path} is there already; remove it or give --out another name")
     if not table.is_file():
         raise InputError(f"data file {table} does not exist")
-    given = read_states(table)
-    largest, slope = _size(table, given)
+    given = read_states(table, tube)
+    largest, slope = _size(table, given, tube)
     axes = [a for k, a in enumerate(AXES) if (np.abs(given.gradients[:, k, k]) > 0.0).any()]
     chosen = "holzapfel_gasser_ogden" if len(axes) > 1 else "holzapfel_ogden_isotropic"
     material = find_law(law or chosen)
     notes = [
-        f"{len(given.free)} states in {_tests(given)}",
+        f"{len(given.free) // (tube.size if tube else 1)} states in {_tests(given)}",
         f"law {material.name}" + ("" if law else ": a guess, give --law NAME"),
-        f"stresses reach {largest:.3g} kPa: ranges of moduli and the noise follow from that",
+        *(f"{name} reaches {most:.3g} {unit}" for name, (most, unit) in largest.items()),
+        f"ranges of moduli follow from a stiffness of {slope:.3g} kPa",
         "incompressible, --forward homogeneous takes the law's kappa; FEM, which checks, takes it, "
         "too",
         f"errors along a curve correlate over {_LENGTH:g} of stretch, their sds are inferred",
     ]
-    bare = [w for w in read_cells(table).words if is_stress(w) and not with_unit(w)[1]]
-    if bare:
-        notes.insert(1, f"{', '.join(bare)} without a unit: kPa, forces mN; write {bare[0]} [MPa]")
-    left_out = len(_every_row(table)) - len(given.free)
+    of_tube = (TubePressure.column, TubeForce.column)
+    names = {word: with_unit(word) for word in read_cells(table).words}
+    measured = [w for w, (name, _) in names.items() if is_stress(w) or name in of_tube]
+    if bare := [w for w in measured if not names[w][1]]:
+        notes.insert(1, f"{', '.join(bare)} without a unit: kPa, forces mN; write {bare[0]} [kPa]")
+    left_out = len(_every_row(table)) - len(given.free) // (tube.size if tube else 1)
     if left_out:
         notes.insert(1, f"{left_out} rows of unloading are left out")
     folder = scene_path.resolve().parent
     source = table.resolve()
     name = source.relative_to(folder) if source.is_relative_to(folder) else source
     scene_path.parent.mkdir(parents=True, exist_ok=True)
-    scene_path.write_text(_scene_text(material, name.as_posix(), axes, slope), encoding="utf-8")
+    text = _scene_text(material, name.as_posix(), axes, slope, tube)
+    scene_path.write_text(text, encoding="utf-8")
     try:
         scene = read_scene(scene_path)
     except InputError:
@@ -112,24 +125,47 @@ def _tests(given: States) -> str:
     return f"{len(names)} tests ({', '.join(names)})" if len(names) > 1 else "one test"
 
 
-def _size(table: Path, given: States) -> tuple[float, float]:
-    """Return the largest stress of the table in kPa, and the largest over the motion there."""
+def _size(
+    table: Path, given: States, tube: Tube | None
+) -> tuple[dict[str, tuple[float, str]], float]:
+    """Return the largest value and the unit of each measurement, and the tissue's stiffness in kPa.
+
+    A stress over the motion there, where it is largest; of a tube, the stress of a thin wall,
+    pressure times inner radius over thickness.
+    """
     neutral = specimen(
-        given, law=find_law("neo_hookean"), parameters=(Parameter("mu", "kPa", 1.0, 10.0),),
-        constants={"lam": 10.0},
+        given, law=find_law("neo_hookean_split"), tube=tube,
+        parameters=(Parameter("mu", "kPa", 1.0, 10.0),), constants={
+            "kappa": 10.0, **dict.fromkeys(_stiffnesses(tube), 1.0)},
     )  # fmt: skip
     observe, data, _ = read_measurements(neutral, table)
-    if list(observe.parts) != [Stress.name]:
+    kinds = {part.kind for part in observe.parts.values()}
+    if not kinds <= set(_STRESSES):
         raise InputError(f"data file {table} has {', '.join(observe.parts)} besides stresses")
-    largest = np.nan_to_num(np.abs(data[Stress.name])).max(axis=1)
-    motion = np.abs(given.gradients).max(axis=(1, 2))
-    if not largest.max() > 0.0:
-        raise InputError(f"data file {table}: all stresses are zero")
+    sizes = {
+        name: (float(np.nanmax(np.abs(values))), observe.parts[name].unit)
+        for name, values in data.items()
+    }
+    for name, (most, _) in sizes.items():
+        if not most > 0.0:
+            raise InputError(f"data file {table}: each {name} is zero")
+    first = next(iter(data))
+    stress = np.nan_to_num(np.abs(data[first])).reshape(len(data[first]), -1).max(axis=1)
+    gradients = measured_states(neutral).gradients
+    if tube is not None:
+        stress = stress * tube.inner_radius / sum(tube.layers)
+    motion = np.abs(gradients).max(axis=(1, 2))
     moved = motion > 0.1 * motion.max()
-    return float(largest.max()), float((largest[moved] / motion[moved]).max())
+    return sizes, float((stress[moved] / motion[moved]).max())
 
 
-def _scene_text(law: Law, table: str, axes: list[str], slope: float) -> str:
+def _stiffnesses(tube: Tube | None) -> list[str]:
+    """Return the names of the layers' factors."""
+    layers = 0 if tube is None or len(tube.layers) == 1 else len(tube.layers)
+    return [f"stiffness_{k + 1}" for k in range(layers)]
+
+
+def _scene_text(law: Law, table: str, axes: list[str], slope: float, tube: Tube | None) -> str:
     """Return the scene file. Fibres are along the first axis that is pulled, sheets across it."""
     lines = [f'law = "{law.name}"   # see docs/laws.md for others', f'specimen = "{table}"']
     if law.fibres:
@@ -143,9 +179,24 @@ def _scene_text(law: Law, table: str, axes: list[str], slope: float) -> str:
     for quantity in law.quantities:
         if quantity.name != "kappa":
             lines += ["", *_parameter(quantity, slope)]
+    layers = _stiffnesses(tube)
+    for name in layers[1:]:
+        lines += [
+            "",
+            f"[parameters.{name}]",
+            "range = [0.1, 2.0]   # CHANGE: over the inner layer's",
+        ]
+    constants = [f"{name} = 1.0" for name in layers[:1]]
     if any(quantity.name == "kappa" for quantity in law.quantities):
-        lines += ["", "[constants]", f"kappa = {_KAPPA * slope:.2g}   # kPa"]
-    lines += ["", *_GRIPS]
+        kappa = (_KAPPA if tube is None else _KAPPA_OF_WALL) * slope
+        constants.append(f"kappa = {kappa:.2g}   # kPa")
+    lines += ["", "[constants]", *constants] if constants else []
+    if tube is None:
+        return "\n".join([*lines, "", *_GRIPS]) + "\n"
+    lines += ["", "[tube]   # the sector that it opens to when it is cut, without stress"]
+    lines.append(f"inner_radius = {tube.inner_radius}   # mm")
+    lines.append(f"layers = {list(tube.layers)}   # mm, from the inside out")
+    lines.append(f"opening_angle = {tube.opening_angle}   # CHANGE: degrees of a turn it lacks")
     return "\n".join(lines) + "\n"
 
 
@@ -168,22 +219,19 @@ def _parameter(quantity: Quantity, slope: float) -> list[str]:
     ]
 
 
-def _experiment_text(scene: str, table: str, largest: float, notes: list[str]) -> str:
+def _experiment_text(
+    scene: str, table: str, sizes: dict[str, tuple[float, str]], notes: list[str]
+) -> str:
     head = ["# A first experiment file; what was guessed:", *(f"# - {note}" for note in notes)]
-    sd = f"{_NOISE * largest:.2g}"
-    return "\n".join(
-        [
-            *head,
+    head += ["", f'scene = "{scene}"', f'data = "{table}"', 'forward = "incompressible"']
+    for name, (largest, unit) in sizes.items():
+        sd = f"{_NOISE * largest:.2g}"
+        head += [
             "",
-            f'scene = "{scene}"',
-            f'data = "{table}"',
-            'forward = "incompressible"',
-            "",
-            "[noise.stress]",
+            f"[noise.{name}]",
             'kind = "correlated"',
             f"length = {_LENGTH}   # of stretch, along a curve",
-            f"sd_scale = {sd}   # kPa, of the independent errors' sd",
-            f"spatial_sd_scale = {sd}   # kPa, of those that correlate",
-            "",
+            f"sd_scale = {sd}   # {unit}, of the independent errors' sd",
+            f"spatial_sd_scale = {sd}   # {unit}, of those that correlate",
         ]
-    )
+    return "\n".join([*head, ""])

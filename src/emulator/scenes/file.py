@@ -22,6 +22,7 @@ from emulator.scenes.scene import Scene
 from emulator.scenes.scene_data import directions_read
 from emulator.scenes.specimen import body_of, read_states
 from emulator.scenes.supports.dirichlet import Support
+from emulator.scenes.tube import Tube
 
 if TYPE_CHECKING:  # pydantic is imported when a scene file is read, not with the package
     from emulator.core.schema import Source
@@ -50,8 +51,11 @@ def read_scene(path: str | Path) -> Scene:
     with source.at("law"):
         law = find_law(file.law)
     supports, regions = file.supports, None
+    with source.at("tube", table=("tube",)):
+        tube = _tube(file)
     if file.specimen is not None:
-        body, supports = _specimen(path.parent, file, source)
+        body, supports = _specimen(path.parent, file, tube, source)
+        regions = tube.regions(len(body.mesh.elements)) if tube is not None else None
     elif not supports:
         raise source.error("key 'supports' is missing; expected tables [[supports]]")
     else:
@@ -86,20 +90,32 @@ def read_scene(path: str | Path) -> Scene:
             dilatation=file.dilatation,
             loaded_by=file.loaded_by,
             grips=grips,
+            tube=tube,
         )
     except InputError as error:
         raise source.error(str(error), _quantity_in(str(error), file)) from error
 
 
-def _specimen(folder: Path, file: SceneFile, source: Source) -> tuple[Body, tuple[Support, ...]]:
+def _specimen(
+    folder: Path, file: SceneFile, tube: Tube | None, source: Source
+) -> tuple[Body, tuple[Support, ...]]:
     """Return the states of the table ``specimen`` as bodies, and the supports that hold them."""
     for key in ("mesh", "bodies", "regions", "supports", "loads", "order"):
         if key in source.data:
             raise source.error("a specimen has none; it is held and moved by its table", (key,))
     with source.at("specimen"):
         assert file.specimen is not None
-        mesh, supports = body_of(read_states(folder / file.specimen))
+        mesh, supports = body_of(read_states(folder / file.specimen, tube))
     return Body(mesh), supports
+
+
+def _tube(file: SceneFile) -> Tube | None:
+    """Return the sector of a tube."""
+    if file.tube is None:
+        return None
+    if file.specimen is None or file.grips is not None:
+        raise InputError("a tube is a specimen without grips; give its table as 'specimen'")
+    return Tube(**file.tube.model_dump())
 
 
 def _grips(folder: Path, file: SceneFile) -> Grips | None:

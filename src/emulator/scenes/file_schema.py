@@ -71,6 +71,20 @@ class GripsTable(Table):
     file."""
 
 
+class TubeTable(Table):
+    """The sector without stress that a tube opens to when it is cut."""
+
+    inner_radius: float
+    """inner radius of the sector, mm."""
+    layers: tuple[float, ...]
+    """thickness of each layer of the sector from the inside out, mm; in layer 2 the law's energy is
+    multiplied by stiffness_2, and so on."""
+    opening_angle: float = 0.0
+    """angle that the sector lacks of a full turn, degrees; twice Fung's opening angle."""
+    points: int = 5
+    """number of points of a layer at which stresses are computed."""
+
+
 class SceneFile(Table):
     """A whole scene file."""
 
@@ -85,6 +99,8 @@ class SceneFile(Table):
     to this file: docs/specimens.md."""
     grips: GripsTable | None = None
     """how the specimen was held; without it, states are homogeneous and nothing else is asked."""
+    tube: TubeTable | None = None
+    """of a specimen that is a tube, whose table has radii and stretch_axial."""
     parameters: dict[str, ParameterTable]
     """what varies: parameters of the law, of loads and of regions."""
     supports: tuple[Annotated[BoundaryCondition, OneOf("kind", SUPPORTS, "held")], ...] = ()

@@ -28,7 +28,8 @@ from emulator.geometry.mesh import Mesh
 from emulator.scenes.grips import Grips
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
-from emulator.scenes.specimen import AXES, States, states_of
+from emulator.scenes.specimen import states_of
+from emulator.scenes.states import AXES, States
 from emulator.scenes.supports.dirichlet import Support
 
 _FACES = (("left", "right"), ("front", "back"), ("bottom", "top"))

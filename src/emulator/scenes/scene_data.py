@@ -30,6 +30,7 @@ from emulator.scenes.tissue import (
     effective_angles,
     region_quantities,
 )
+from emulator.scenes.tube import Tube
 
 Dilatation = Literal["pointwise", "mean", "patch"]
 """The part of a body that shares a volume change: a point, an element, or a patch of elements."""
@@ -70,6 +71,7 @@ class SceneData:
         ``{"pressure": "imaged"}``. A simulator then unloads and loads
         (:mod:`emulator.fem.loaded`), and displacements are those from the mesh.
     grips : how a specimen was held (:mod:`emulator.scenes.gripped`).
+    tube : the sector that a specimen's states are points of (:mod:`emulator.scenes.tube`).
     """
 
     name: str
@@ -88,6 +90,7 @@ class SceneData:
     angles: tuple[FibreAngles, ...] = ()
     loaded_by: Mapping[str, str] = field(default_factory=dict)
     grips: Grips | None = None
+    tube: Tube | None = None
 
     def __post_init__(self) -> None:
         for name in ("constants", "origin", "loaded_by"):

@@ -1,32 +1,17 @@
 r"""Specimens: pieces of tissue in a testing machine, in homogeneous states.
 
-Uniaxial, biaxial and shear tests deform the middle of a piece evenly, by one gradient
-
-.. math:: F = I + H, \qquad H = \partial u / \partial X .
-
-The machine prescribes some components of H, and across a free direction i nothing pulls,
-:math:`P_{ii} = 0`. A specimen is a scene with one tetrahedron of corners :math:`0, e_x, e_y, e_z`
-(mm) for each measured state: node k moves by column k of H, and FEM of it is exact. Supports hold
-what is prescribed. Shears that a table does not mention are zero.
-
-========================  ====================================================
-column                    is
-========================  ====================================================
-``stretch_x``             :math:`\lambda = F_{xx}`, 1 at rest
-``strain_x``              :math:`\lambda - 1`
-``green_x``               :math:`(\lambda^2 - 1)/2`
-``shear_xy``              :math:`F_{xy}`, the amount of shear along x of planes normal to y
-========================  ====================================================
-
-Strains and shears may be in percent, ``strain_x [%]``. A direction without a value is free.
+Uniaxial, biaxial and shear tests deform the middle of a piece evenly. A specimen is a scene with
+one tetrahedron of corners :math:`0, e_x, e_y, e_z` (mm) for each state of
+:mod:`emulator.scenes.states`, or for each point of a tube's wall in each state
+(:mod:`emulator.scenes.tube`): node k moves by column k of H, and FEM of it is exact. Supports hold
+what is prescribed.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -34,156 +19,13 @@ from emulator.core.cells import PROTOCOL, read_cells
 from emulator.core.errors import InputError
 from emulator.geometry.mesh import Mesh
 from emulator.scenes.scene import Scene
+from emulator.scenes.states import AXES, States, motion_columns, states
 from emulator.scenes.supports.dirichlet import Support
+from emulator.scenes.tube import Tube
+from emulator.scenes.tube import motion_columns as tube_columns
 
-AXES = "xyz"
-_MOTION = re.compile(r"(stretch|strain|green)_([xyz])|shear_([xyz])([xyz])")
-_WITH_UNIT = re.compile(r"([^\[(]*[^\[( ]) *(?:[\[(] *([^\])]*?) *[\])])?")
-_RANGE = (0.2, 5.0)  # of a stretch
-_MOST_SHEAR = 3.0
 _APART = 2.0  # mm between the tetrahedra of two states
-_ROUND_OFF = 1e-9
 _CORNER = "corner."  # before the names of the sets that supports hold; other sets are tests
-
-
-class States(NamedTuple):
-    """Homogeneous states of a specimen.
-
-    gradients : the prescribed H = F - I, (m, 3, 3); zero in free directions.
-    free : whether the stretch along each axis is free, (m, 3).
-    protocols : the rows (k,) of each test, by its name.
-    """
-
-    gradients: np.ndarray
-    free: np.ndarray
-    protocols: Mapping[str, np.ndarray]
-
-    @property
-    def paths(self) -> np.ndarray:
-        """The way (m,) of each state from the first of its test, in stretch."""
-        found = np.zeros(len(self.gradients))
-        for rows in self.protocols.values():
-            steps = np.linalg.norm(np.diff(self.gradients[rows], axis=0), axis=(1, 2))
-            found[rows[1:]] = np.cumsum(steps)
-        return found
-
-
-def with_unit(word: str) -> tuple[str, str]:
-    """Return the name and the unit of a column such as ``stress_x [kPa]``; no unit is empty."""
-    found = _WITH_UNIT.fullmatch(word.strip())
-    return (found[1], found[2] or "") if found else (word, "")
-
-
-def motion_columns(words: Collection[str]) -> list[str]:
-    """Return the columns that say how a specimen moves."""
-    return [word for word in words if _MOTION.fullmatch(with_unit(word)[0])]
-
-
-def states(
-    columns: Mapping[str, np.ndarray],
-    protocols: Sequence[str] | None = None,
-    *,
-    ordered: bool = True,
-) -> States:
-    """Return the states that columns (m,) of a table describe, NaN where a direction is free.
-
-    Parameters
-    ----------
-    protocols : the name of each row's test; by default all rows are of one.
-    ordered : whether the rows of a test lead away from rest, with the same directions free.
-
-    Raises
-    ------
-    InputError
-        No column or two of one component, a unit that is no percent, a stretch that is none, a
-        state in which nothing or everything is free, or a test that goes back.
-    """
-    if not columns:
-        raise InputError("no column says how the specimen moves: stretch_x, strain_x or shear_xy")
-    count = len(next(iter(columns.values())))
-    H = np.full((count, 3, 3), 0.0)
-    H[:, range(3), range(3)] = np.nan
-    sources: dict[tuple[int, int], str] = {}
-    for word, values in columns.items():
-        name, unit = with_unit(word)
-        found = _MOTION.fullmatch(name)
-        assert found is not None
-        measure, axis, *plane = found.groups()
-        place = tuple(AXES.index(a) for a in (plane if axis is None else (axis, axis)))
-        if place in sources or (axis is None and place[0] == place[1]):
-            other = sources.get((place[0], place[1]), "a stretch")
-            raise InputError(f"column '{word}' says the same as '{other}'; leave one out")
-        sources[place[0], place[1]] = word
-        H[:, place[0], place[1]] = _component(word, measure, unit, np.asarray(values, dtype=float))
-    free = np.isnan(H[:, range(3), range(3)])
-    gradients = np.where(np.isnan(H), 0.0, H)
-    _check(gradients, free, sources)
-    names = [""] * count if protocols is None else list(protocols)
-    rows = {n: np.flatnonzero([n == name for name in names]) for n in dict.fromkeys(names)}
-    for name, own in rows.items() if ordered else ():
-        _check_path(gradients[own], free[own], own, name)
-    return States(gradients, free, rows)
-
-
-def _component(word: str, measure: str | None, unit: str, values: np.ndarray) -> np.ndarray:
-    """Return the component of H that a column gives, NaN where it is free."""
-    if unit not in ("", "1", "-", "%", "mm/mm") or (unit == "%" and measure == "stretch"):
-        raise InputError(f"column '{word}': unit '{unit}'; a stretch has none, a strain none or %")
-    values = 0.01 * values if unit == "%" else values
-    if measure is None:
-        return np.where(np.isnan(values), 0.0, values)
-    if measure == "green":
-        if (values <= -0.5).any():
-            raise InputError(f"column '{word}' goes down to {np.nanmin(values):g}; above -0.5")
-        return np.sqrt(1.0 + 2.0 * values) - 1.0
-    return values - 1.0 if measure == "stretch" else values
-
-
-def _check(H: np.ndarray, free: np.ndarray, sources: Mapping[tuple[int, int], str]) -> None:
-    """Refuse states that no specimen has."""
-    for (i, j), word in sources.items():
-        value, held = H[:, i, j] + (i == j), ~free[:, i] | (i != j)
-        low, high = _RANGE if i == j else (-_MOST_SHEAR, _MOST_SHEAR)
-        bad = np.flatnonzero(((value < low) | (value > high)) & held)
-        if len(bad):
-            hint = f"is it in percent? call it '{with_unit(word)[0]} [%]'"
-            if "stretch" in word:
-                hint = "a stretch is 1 at rest; a strain goes in strain_x, in percent strain_x [%]"
-            kind = "stretch" if i == j else "shear"
-            raise InputError(
-                f"row {bad[0] + 1}, column '{word}' is a {kind} of {value[bad[0]]:g}, outside "
-                f"{low:g} to {high:g}: {hint}"
-            )
-    sheared = (np.abs(H) * (1.0 - np.eye(3))).any(axis=(1, 2))
-    loose = np.flatnonzero(free.all(axis=1) & ~sheared)
-    if len(loose):
-        raise InputError(f"row {loose[0] + 1} has no stretch and no shear; give one, or drop it")
-    J = np.linalg.det(np.eye(3) + H)
-    closed = np.flatnonzero(~free.any(axis=1) & (J <= 0.0))
-    if len(closed):
-        raise InputError(f"row {closed[0] + 1} turns the specimen inside out")
-
-
-def _check_path(H: np.ndarray, free: np.ndarray, rows: np.ndarray, name: str) -> None:
-    """Refuse a test in which a stretch is missing in some rows.
-
-    Or one that goes back: unloading, or a second test under the same name.
-    """
-    test = f" of '{name}'" if name else ""
-    for axis, own in zip(AXES, free.T, strict=True):
-        if own.any() and not own.all():
-            raise InputError(
-                f"row {rows[np.argmax(own)] + 1}{test} has no stretch along {axis}, others have: "
-                "give it, leave the row out, or name another test in a column 'protocol'"
-            )
-    away = np.linalg.norm(np.where(free[:, :, None] & np.eye(3, dtype=bool), 0.0, H), axis=(1, 2))
-    back = np.flatnonzero(np.diff(away) < -_ROUND_OFF)
-    if len(back):
-        raise InputError(
-            f"row {rows[back[0] + 1] + 1}{test} is nearer to rest than the one before: unloading "
-            "goes under 'unloading' in a column 'branch', another test under another name in a "
-            f"column '{PROTOCOL}'"
-        )
 
 
 def body_of(given: States) -> tuple[Mesh, tuple[Support, ...]]:
@@ -211,35 +53,64 @@ def body_of(given: States) -> tuple[Mesh, tuple[Support, ...]]:
     return Mesh(nodes, elements, {**tests, **sets}), tuple(supports)
 
 
-def specimen(given: States | Mapping[str, Any], *, ordered: bool = True, **entries: Any) -> Scene:
+def specimen(
+    given: States | Mapping[str, Any],
+    *,
+    ordered: bool = True,
+    tube: Tube | None = None,
+    **entries: Any,
+) -> Scene:
     """Return the scene of a specimen.
 
     Parameters
     ----------
-    given : its states, or the columns (m,) of :func:`states`, of one test.
+    given : its states, or the columns (m,) of :func:`~emulator.scenes.states.states`, of one test.
     ordered : see there.
+    tube : the sector of a tube whose motion ``given`` is, see :mod:`emulator.scenes.tube`. With
+        several layers, region k of the scene is layer k, from the inside.
     entries : the fields of a :class:`Scene` besides mesh and supports; fibres and sheets may be one
         direction (3,).
     """
-    given = given if isinstance(given, States) else states(given, ordered=ordered)
+    if not isinstance(given, States):
+        given = states_in(given, tube=tube, ordered=ordered)
     mesh, supports = body_of(given)
     for name in ("fibres", "sheets"):
         if entries.get(name) is not None:
             entries[name] = np.broadcast_to(entries[name], (len(mesh.elements), 3))
+    if tube is not None:
+        entries |= {"tube": tube, "regions": tube.regions(len(mesh.elements))}
     return Scene(mesh=mesh, supports=supports, **{"name": "specimen", **entries})
 
 
-def read_states(path: Path) -> States:
+def states_in(
+    columns: Mapping[str, Any],
+    protocols: list[str] | None = None,
+    *,
+    tube: Tube | None = None,
+    ordered: bool = True,
+) -> States:
+    """Return the states that columns (m,) of a table describe, of a piece or of a tube's wall."""
+    read = states if tube is None else tube.states
+    return read(columns, protocols, ordered=ordered)
+
+
+def read_states(path: Path, tube: Tube | None = None) -> States:
     """Return the states of a table's rows; the column ``protocol`` names their tests."""
     cells = read_cells(path)
-    words, rows = motion_columns(cells.words), list(cells.rows)
+    moving = motion_columns if tube is None else tube_columns
+    words, rows = moving(cells.words), list(cells.rows)
+    if tube is None and not words and (of_tube := tube_columns(cells.words)):
+        raise InputError(
+            f"data file {path} is of a tube ({', '.join(of_tube)}); give the sector that it opens "
+            "to: calibrate init --tube, or [tube] in the scene file"
+        )
     columns = {w: np.array([cells.number(k, w, gaps=True) for k in rows]) for w in words}
     names = [cells.rows[k][PROTOCOL] for k in rows] if PROTOCOL in cells.words else None
     try:
         if names is not None and "" in names:
             row = names.index("") + 1
             raise InputError(f"row {row}, column '{PROTOCOL}' is empty; name the row's test")
-        return states(columns, names)
+        return states_in(columns, names, tube=tube)
     except InputError as error:
         raise InputError(f"data file {path}: {error}") from error
 
@@ -271,3 +142,15 @@ def states_of(scene: Scene) -> States:
         if not name.startswith(_CORNER)
     }
     return States(H, free, tests or {"": np.arange(len(corners))})
+
+
+def measured_states(scene: Scene) -> States:
+    """Return a state for each measured one: of a tube, that of the innermost point of the wall.
+
+    :class:`InputError` for a scene that is no specimen.
+    """
+    H, free, tests = states_of(scene)
+    each = 1 if scene.tube is None else scene.tube.size
+    return States(
+        H[::each], free[::each], {name: rows[::each] // each for name, rows in tests.items()}
+    )

@@ -35,7 +35,8 @@ from emulator.fem.simulator import Simulator
 from emulator.scenes.gripped import Piece, pieces
 from emulator.scenes.grips import Learned
 from emulator.scenes.scene import Scene
-from emulator.scenes.specimen import States, states_of
+from emulator.scenes.specimen import states_of
+from emulator.scenes.states import States
 from emulator.surrogates.homogeneous import homogeneous_stresses
 from emulator.surrogates.polynomial import Samples, fit, legendre, terms
 from emulator.surrogates.protocol import fingerprint_of

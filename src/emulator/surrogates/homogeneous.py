@@ -32,7 +32,8 @@ from emulator.fem.energy import point_energy
 from emulator.fem.material_point import stress_and_moduli
 from emulator.mechanics.kinematics import cofactor, determinant
 from emulator.scenes.scene import Scene, all_nodes, check_nodes
-from emulator.scenes.specimen import States, states_of
+from emulator.scenes.specimen import states_of
+from emulator.scenes.states import States
 from emulator.surrogates.protocol import ForwardKind, Prediction, fingerprint_of
 
 _ITERATIONS = 300  # an exponent falls by about 1 in each, far away

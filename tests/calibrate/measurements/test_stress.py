@@ -10,7 +10,8 @@ from calibrate.measurements.collection import observations
 from calibrate.measurements.data import read_measurements, write_data
 from emulator.core.errors import InputError
 from emulator.scenes.scene import all_nodes
-from emulator.scenes.specimen import specimen, states
+from emulator.scenes.specimen import specimen
+from emulator.scenes.states import states
 from emulator.surrogates.homogeneous import Homogeneous
 
 S = np.linspace(1.0, 1.4, 5)

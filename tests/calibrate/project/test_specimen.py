@@ -61,7 +61,7 @@ def test_any_law_is_drafted(tmp_path, law, lacks):
     ("text", "message"),
     [
         ("stretch_x\n1.0\n1.1\n", "column 'stress_x' is missing"),
-        ("stretch_x,stress_x\n1.0,0\n1.1,0\n", "all stresses are zero"),
+        ("stretch_x,stress_x\n1.0,0\n1.1,0\n", "each stress is zero"),
         ("x,y\n1.0,0\n", "no column says how the specimen moves"),
         ("stretch_x,stress_x\n1.0,0\n1.1,1\n1.0,0\n1.2,2\n", "another test under another name"),
     ],
@@ -103,6 +103,34 @@ def test_stresses_without_a_unit_are_named(tmp_path):
     (tmp_path / "test.csv").write_text(table().replace("stress_x [kPa]", "stress_x"))
     notes = draft_specimen(tmp_path / "test.csv", tmp_path / "test.toml").notes
     assert any("stress_x without a unit: kPa" in note for note in notes)
+
+
+TUBE = """protocol,outer_diameter [mm],stretch_axial,pressure [mmHg],force_axial [g]
+a,10.9,1.3,14.5,64.4
+a,11.1,1.3,25.0,65.2
+b,10.5,1.5,24.7,106.1
+"""
+
+
+def test_a_tube_has_its_files_by_one_command(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "tube.csv").write_text(TUBE)
+    assert main(["init", "tube.csv", "--tube", "4.6,0.9,0.5", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["states"] == 3
+    assert told["parameters"] == ["c", "k_1", "k_2", "angle", "stiffness_2"]
+    scene = read_scene(tmp_path / "tube_scene.toml")
+    assert scene.tube == em.Tube(4.6, (0.9, 0.5))
+    assert set(np.unique(scene.regions)) == {1, 2}
+    assert set(read_experiment(tmp_path / "tube.toml").run.noise) == {"tube_pressure", "tube_force"}
+    for words, told in (
+        (["tube.csv", "--tube", "4.6"], "layers are ()"),
+        (["tube.csv", "--tube", "wide"], "such as --tube 4.2,0.9"),
+        (["tube.csv"], "is of a tube (outer_diameter"),
+        (["tube.msh", "--tube", "4.6,0.9"], "not for a mesh"),
+    ):
+        assert main(["init", *words, "--out", "other.toml"]) == 2
+        assert told in capsys.readouterr().err
 
 
 GRIPPED = """law = "holzapfel_ogden_isotropic"

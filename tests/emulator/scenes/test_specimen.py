@@ -6,7 +6,8 @@ import pytest
 import emulator as em
 from emulator.core.errors import InputError
 from emulator.scenes.file import read_scene
-from emulator.scenes.specimen import read_states, specimen, states, states_of, with_unit
+from emulator.scenes.specimen import read_states, specimen, states_of
+from emulator.scenes.states import states, with_unit
 
 NAN = np.nan
 

@@ -13,7 +13,8 @@ from emulator.core.errors import InputError
 from emulator.fem.energy import strain_energy
 from emulator.scenes.gripped import pieces
 from emulator.scenes.grips import Grips, Learned
-from emulator.scenes.specimen import specimen, states
+from emulator.scenes.specimen import specimen
+from emulator.scenes.states import states
 from emulator.surrogates.gripped import GrippedSpecimen, learn_grips
 
 PULL = np.array([1.0, 1.05, 1.1, 1.2])

@@ -8,7 +8,8 @@ import pytest
 import emulator as em
 from emulator.core.errors import InputError
 from emulator.scenes.scene import all_nodes
-from emulator.scenes.specimen import specimen, states
+from emulator.scenes.specimen import specimen
+from emulator.scenes.states import states
 from emulator.surrogates.homogeneous import Homogeneous
 
 NAN = np.nan

@@ -10,7 +10,7 @@ import textwrap
 from argparse import Namespace
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from calibrate.cli import words
 from calibrate.cli.output import table
@@ -18,12 +18,21 @@ from calibrate.cli.words import Answer, command, option
 from emulator.core.errors import InputError
 from emulator.core.store import check_folder, to_json
 
+if TYPE_CHECKING:
+    from emulator.scenes.tube import Tube
+
 
 @command(
     option("mesh", "FILE", "mesh of tetrahedra, or the table of a specimen's test"),
     option("--out", "FILE.toml", "file to write (default: beside the first)"),
     option("--unit", "mm|cm|m|um", "of the mesh's coordinates (default: guessed, and said)"),
     option("--law", "NAME", "default: by whether there are fibres"),
+    option(
+        "--tube",
+        "RADIUS,LAYER[,...]",
+        "of a table of a tube: inner radius of the sector that it opens to, thickness of each "
+        "layer from the inside, mm",
+    ),
     help="first files for your mesh, or for the table of a test",
     description="Reads a mesh (gmsh, VTU and whatever meshio reads), says which sets it has, "
     "guesses from their names and from its size, says so, and writes a commented scene file. Of a "
@@ -39,6 +48,8 @@ def init(arguments: Namespace) -> Answer:
     out = arguments.out or mesh_path.parent / f"{mesh_path.stem or 'scene'}.toml"
     if mesh_path.suffix.lower() in (*TEXT, *SPREADSHEETS):
         return _init_specimen(mesh_path, out, arguments)
+    if arguments.tube is not None:
+        raise InputError("--tube is for a table of stretches and pressures, not for a mesh")
     draft = draft_scene(arguments.mesh, out, unit=arguments.unit, law=arguments.law)
     scene, mesh = draft.scene, draft.scene.mesh
     facets = {name: len(rows) for name, rows in mesh.facet_sets.items()}
@@ -66,16 +77,18 @@ def init(arguments: Namespace) -> Answer:
 def _init_specimen(table_path: Path, out: str | Path, arguments: Namespace) -> Answer:
     """Write the files for a table, and say what was guessed."""
     from calibrate.project.specimen import draft_specimen
+    from emulator.scenes.specimen import measured_states
 
     if arguments.unit is not None:
         raise InputError(
             "--unit has no effect on a table: its columns have units, 'stress_x [MPa]'"
         )
-    draft = draft_specimen(table_path, out, law=arguments.law)
+    tube = None if arguments.tube is None else _tube(arguments.tube)
+    draft = draft_specimen(table_path, out, law=arguments.law, tube=tube)
     result = {
         "out": str(draft.path),
         "scene": str(draft.scene_path),
-        "states": len(draft.scene.mesh.elements),
+        "states": len(measured_states(draft.scene).free),
         "law": draft.scene.law.name,
         "parameters": list(draft.scene.parameter_names),
         "notes": list(draft.notes),
@@ -86,6 +99,20 @@ def _init_specimen(table_path: Path, out: str | Path, arguments: Namespace) -> A
         f"calibrate infer {draft.path} --out RUN",
     ]
     return Answer(result, "\n".join(lines))
+
+
+def _tube(text: str) -> Tube:
+    """Return the sector that ``RADIUS,LAYER,...`` describes."""
+    from emulator.scenes.tube import Tube
+
+    try:
+        radius, *layers = map(float, text.split(","))
+    except ValueError:
+        raise InputError(
+            f"--tube '{text}'; give the sector's inner radius and the thickness of each layer in "
+            "mm, such as --tube 4.2,0.9"
+        ) from None
+    return Tube(radius, tuple(layers))
 
 
 _PLACE = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}

@@ -1,0 +1,151 @@
+"""Curves of a specimen's test: what was measured in each of its states, one state after another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibrate.measurements.observation import Block, Field
+from calibrate.measurements.points import PointObservation
+from calibrate.noise.protocol import Sites
+from emulator.core.errors import InputError
+from emulator.scenes.scene import Scene, all_nodes
+from emulator.scenes.specimen import measured_states, states_in
+from emulator.scenes.states import AXES, States
+
+_APART = 1e3  # distance between the sites of two tests, whose errors do not correlate
+_ROUND_OFF = 1e-6
+
+
+class SpecimenCurves(PointObservation):
+    """Numbers (d, c), or (d,) without components, measured in the d states of a specimen.
+
+    A kind computes them from all nodes in ``_measured``, and gives its columns.
+
+    scene : the specimen; :class:`InputError` for another scene.
+    """
+
+    scene: Scene
+
+    place_field = Field("motion", ("stretch_x",), where=True)
+    constants = {"stretch": "stretches"}
+    curve_axis = "way from the first state of each test, in stretch"
+    positive = False
+
+    def __post_init__(self) -> None:
+        measured_states(self.scene)  # refuses what is no specimen
+        self._derive(nodes=all_nodes(self.scene))
+
+    def _measured(self, u: jax.Array, theta: jax.Array) -> jax.Array:
+        """Return the numbers (d, c) at the displacement (n, 3) mm of all nodes."""
+        raise NotImplementedError
+
+    @cached_property
+    def states(self) -> States:
+        """The measured states."""
+        return measured_states(self.scene)
+
+    @property
+    def _full_shape(self) -> tuple[int, ...]:
+        count = len(self.states.free)
+        return (count, len(self.components)) if self.components else (count,)
+
+    @cached_property
+    def stretches(self) -> np.ndarray:
+        """The prescribed stretches of the states along x, y and z, (d, 3); NaN where free."""
+        diagonals = np.diagonal(self.states.gradients, axis1=1, axis2=2)
+        return np.where(self.states.free, np.nan, 1.0 + diagonals)
+
+    @property
+    def tests(self) -> Mapping[str, np.ndarray]:
+        """The states (k,) of each test by its name; one without a name where none has any."""
+        return self.states.protocols
+
+    @cached_property
+    def paths(self) -> np.ndarray:
+        """The way of each state from the first of its test, in stretch, and the test's place."""
+        paths = np.zeros((len(self.states.free), 3))
+        paths[:, 0] = self.states.paths
+        for number, rows in enumerate(self.tests.values()):
+            paths[rows, 1] = _APART * number
+        return paths
+
+    @property
+    def sites(self) -> Sites:
+        """The way along each test in stretch, so that errors correlate along its curve."""
+        sites = Sites.of(self.paths, max(len(self.components), 1))
+        return sites if self.entries is None else Sites(*(each[self.entries] for each in sites))
+
+    @property
+    def curves(self) -> Mapping[str, tuple[np.ndarray, np.ndarray]]:
+        """The curve of each test and component, over the way in stretch."""
+        names = self.components or (self.name,)
+        every = np.arange(len(self.paths) * len(names))
+        states, columns = np.divmod(every if self.entries is None else self.entries, len(names))
+        found = {}
+        for test, rows in self.tests.items():
+            for c, name in enumerate(names):
+                own = np.flatnonzero(np.isin(states, rows) & (columns == c))
+                if len(own):
+                    found[f"{test} {name}".strip()] = self.paths[states[own], 0], own
+        return found
+
+    def rows(self) -> tuple[str, np.ndarray]:
+        """Return the numbers of the states."""
+        return "state", np.arange(len(self.paths))
+
+    def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
+        """Return the numbers (..., d, c), or (..., d) without components."""
+        shape = "(d,c)" if self.components else "(d)"
+        return jnp.vectorize(self._measured, signature=f"(k,i),(p)->{shape}")(displacement, theta)
+
+    def check_motion(self, columns: Mapping[str, np.ndarray]) -> Self:
+        """Return the observation if a table's columns of motion are its own states."""
+        scene, expected = self.scene, self.states
+        found = states_in(columns, tube=scene.tube, ordered=False)
+        each = 1 if scene.tube is None else scene.tube.size
+        if len(found.free) != each * len(expected.free):
+            raise InputError(
+                f"{len(found.free) // each} rows say how the specimen moves; scene '{scene.name}' "
+                f"has {len(expected.free)} states"
+            )
+        apart = np.abs(found.gradients[::each] - expected.gradients).max(axis=(1, 2))
+        other = np.flatnonzero(
+            (apart > _ROUND_OFF) | (found.free[::each] != expected.free).any(axis=1)
+        )
+        if len(other):
+            raise InputError(
+                f"row {other[0] + 1} moves otherwise than the state of scene '{scene.name}'"
+            )
+        return self
+
+    def motion(self) -> Block:
+        """Return the columns of a data file that say how the specimen moves."""
+        arrays = {f"stretch_{a}": self.stretches[:, k] for k, a in enumerate(AXES)}
+        arrays |= {
+            f"shear_{a}{b}": self.states.gradients[:, i, j]
+            for i, a in enumerate(AXES)
+            for j, b in enumerate(AXES)
+            if i != j
+        }
+        if self.scene.tube is not None:
+            arrays = self.scene.tube.motion(self.stretches)
+        return [(Field(word, (word,)), x) for word, x in arrays.items() if np.nan_to_num(x).any()]
+
+
+def factor(word: str, unit: str, usual: str, known: Mapping[str, float]) -> float:
+    """Return the factor from a column's unit, ``usual`` where it has none."""
+    plain = unit.replace("²", "2").replace("^", "") or usual
+    if plain not in known:
+        raise InputError(f"column '{word}': unit '{unit}' is unknown; one of {', '.join(known)}")
+    return known[plain]
+
+
+IN_KPA = {"kPa": 1.0, "Pa": 1e-3, "MPa": 1e3, "mmHg": 0.13332239, "g/cm2": 0.0980665}
+IN_MN = {"mN": 1.0, "N": 1e3, "g": 9.80665, "gf": 9.80665, "kN": 1e6}
+"""Units of columns of stresses in kPa, and of forces in mN."""

@@ -1,0 +1,110 @@
+r"""What is measured of a tube: the pressure inside, and the force along it.
+
+Both are integrals of the wall's stresses (:mod:`emulator.scenes.tube`), with
+:math:`\hat\sigma = P F^T / J`. Columns are ``pressure`` and ``force_axial``, the force besides that
+of the pressure on closed ends; units as in ``pressure [mmHg]``, kPa and mN without one.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibrate.measurements.observation import Block, Field, Table
+from calibrate.measurements.specimens import IN_KPA, IN_MN, SpecimenCurves, factor
+from emulator.core.errors import InputError
+from emulator.mechanics.kinematics import determinant
+from emulator.scenes.scene import Scene
+from emulator.scenes.states import with_unit
+from emulator.scenes.tube import Tube, motion_columns
+from emulator.surrogates.homogeneous import homogeneous_stresses
+
+
+@dataclass(frozen=True, eq=False)
+class OfTube(SpecimenCurves):
+    """One number (d,) for each state of a tube; ``column`` and ``units`` are those of its table."""
+
+    scene: Scene
+
+    column: ClassVar[str]
+    units: ClassVar[Mapping[str, float]]
+    arguments = ()
+    components = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.scene.tube is None:
+            raise InputError(f"scene '{self.scene.name}' is no tube, which has a {self.column}")
+
+    @property
+    def tube(self) -> Tube:
+        """The sector of the tube."""
+        assert self.scene.tube is not None
+        return self.scene.tube
+
+    def _measured(self, u: jax.Array, theta: jax.Array) -> jax.Array:
+        H, P = homogeneous_stresses(self.scene, u, theta)
+        F = H + jnp.eye(3)
+        cauchy = jax.vmap(lambda P, F: P @ F.T / determinant(F))(P, F)
+        return self._integral(*(jnp.diagonal(a, axis1=1, axis2=2)[:, :2] for a in (F, cauchy)))
+
+    @abstractmethod
+    def _integral(self, stretches: jax.Array, cauchy: jax.Array) -> jax.Array:
+        """Return the number (d,) from what :meth:`Tube.pressure` takes."""
+
+    @classmethod
+    def tables(cls, words: Collection[str]) -> dict[str, Table]:
+        """Return the table of the columns of motion, and that of the measured number."""
+        given = [w for w in words if with_unit(w)[0] == cls.column] or [cls.column]
+        columns = [*(motion_columns(words) or ["outer_radius", "stretch_axial"]), given[0]]
+        fields = [Field(word, (word,), where=word != given[0]) for word in columns]
+        return {cls.name: Table((), tuple(fields))}
+
+    @classmethod
+    def read(
+        cls, scene: Scene, name: str, table: Table, arrays: Mapping[str, np.ndarray]
+    ) -> tuple[Self, np.ndarray]:
+        """Return the observation and its data, of the states that the scene has."""
+        *_, measured = table.fields
+        part = cls(scene).check_motion({w: arrays[w] for w in motion_columns(arrays)})
+        word = measured.variable
+        values = arrays[word] * factor(word, with_unit(word)[1], cls.unit, cls.units)
+        return part, values
+
+    def block(self, name: str, values: np.ndarray) -> Block:
+        """Return the motion of each state, and the number."""
+        return [*self.motion(), (Field(self.column, (self.column,)), values)]
+
+
+class TubePressure(OfTube):
+    """Pressures (d,) in kPa inside a tube, in each of its states."""
+
+    kind = name = usage = "tube_pressure"
+    quantity = "pressure"
+    column = "pressure"
+    unit = "kPa"
+    units = IN_KPA
+    other_units = {"mmHg": 0.13332239, "Pa": 1e-3, "MPa": 1e3}
+
+    def _integral(self, stretches: jax.Array, cauchy: jax.Array) -> jax.Array:
+        return self.tube.pressure(stretches, cauchy)
+
+
+class TubeForce(OfTube):
+    """Reduced axial forces (d,) in mN of a tube, in each of its states."""
+
+    kind = name = usage = "tube_force"
+    quantity = "force"
+    column = "force_axial"
+    unit = "mN"
+    units = IN_MN
+    other_units = {"N": 1e3, "gf": 9.80665}
+
+    def _integral(self, stretches: jax.Array, cauchy: jax.Array) -> jax.Array:
+        return self.tube.axial_force(stretches, cauchy)
