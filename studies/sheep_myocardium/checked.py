@@ -23,17 +23,9 @@ from studies.sheep_myocardium.inference import Found, parameters
 from studies.sheep_myocardium.solver import FINER
 
 from calibrate.certificate.estimates import jackknife, moments
-from calibrate.certificate.verdict import (
-    Certificate,
-    Changes,
-    Evidence,
-    Figure,
-    MeshChange,
-    Physics,
-    Sampling,
-    Tail,
-    judge,
-)
+from calibrate.certificate.evidence import Changes, Evidence, Figure, MeshChange, Physics, Tail
+from calibrate.certificate.verdict import Certificate, judge
+from calibrate.posterior.diagnosis import Sampling
 from calibrate.samplers.diagnostics import pareto_shape
 
 _LEFT = 0.3  # of the mesh's correction

@@ -27,6 +27,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -85,7 +86,7 @@ class Terms(TableRepr):
         return "Probability of each term", rows
 
 
-def find_terms(model: Model, data: Mapping[str, np.ndarray] | np.ndarray) -> Terms:
+def find_terms(model: Model, data: Mapping[str, Any] | np.ndarray) -> Terms:
     """Return which of the moduli of ``model``'s scene are not zero.
 
     Every unknown of the scene is such a modulus. The noise is the model's, its inferred sds in the

@@ -33,17 +33,10 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import logsumexp
 
+from calibrate.certificate.evidence import LARGEST_MASS, Changes, Evidence, Figure, Physics, Tail
 from calibrate.certificate.pool import Pool
 from calibrate.certificate.predictive import Correction, Predictive
 from calibrate.certificate.runs import Runs, least_likely
-from calibrate.certificate.verdict import (
-    LARGEST_MASS,
-    Changes,
-    Evidence,
-    Figure,
-    Physics,
-    Tail,
-)
 from calibrate.posterior import Posterior
 from calibrate.posterior.diagnosis import Misfit, Sampling, places_of
 from calibrate.samplers.diagnostics import effective, normalised, pareto_shape

@@ -24,6 +24,7 @@ import numpy as np
 from tqdm import tqdm
 
 from calibrate.certificate.estimates import as_figures, jackknife, moments
+from calibrate.certificate.evidence import MeshChange, all_within
 from calibrate.certificate.pool import Pool
 from calibrate.certificate.predictive import (
     Correction,
@@ -33,7 +34,6 @@ from calibrate.certificate.predictive import (
     no_correction,
 )
 from calibrate.certificate.runs import Runs
-from calibrate.certificate.verdict import MeshChange, all_within
 from calibrate.statistical_model.finer_fem import Finer, FinerFEM, finer_fem
 from emulator.accuracy.mesh_error import MeshErrorEstimate
 from emulator.core.display import counting

@@ -13,7 +13,9 @@ import numpyro.distributions as dist
 from markupsafe import Markup
 
 from calibrate.analysis.identifiability import identify, in_words
-from calibrate.certificate.verdict import LARGEST_LOG_SD, LARGEST_MESH_SHIFT, LARGEST_SHIFT, shifts
+from calibrate.analysis.terms import find_terms
+from calibrate.certificate.evidence import LARGEST_LOG_SD, LARGEST_MESH_SHIFT, LARGEST_SHIFT
+from calibrate.certificate.verdict import shifts
 from calibrate.posterior import Posterior
 from calibrate.posterior.posterior import describe_distribution
 from calibrate.project import Run, holds_population, read_posterior, simulator_of
@@ -22,6 +24,7 @@ from calibrate.project.results import CERTIFICATE, REPORT
 from calibrate.report import charts, parts, population
 from calibrate.report.body import body_figure
 from calibrate.report.parts import Verdict
+from emulator.core.errors import InputError
 from emulator.core.store import read_json, replacing
 from emulator.scenes.specimen import is_specimen
 
@@ -78,7 +81,7 @@ def html_of(
         ("Data against prediction", data or [parts.note("The run kept no predictions.")]),
         ("Parameters", _parameters(run, posterior, certificate, labels)),
         *body,
-        ("What the data determine", _known(posterior)),
+        ("What the data determine", [*_known(posterior), *_terms(posterior)]),
         ("Draws", [parts.chart(figure) for figure in draws]),
         ("Where this comes from, and how to repeat it", _provenance(run, posterior)),
     ]
@@ -160,6 +163,27 @@ def _known(posterior: Posterior) -> list[Markup]:
         head = ("load state", "cavity volume (mL), median and 90 %")
         blocks += [parts.table(head, rows), parts.paragraph(text)]
     return blocks
+
+
+def _terms(posterior: Posterior) -> list[Markup]:
+    """Return which terms a specimen's law needs, where its data are linear in the moduli."""
+    if not is_specimen(posterior.model.forward.scene):
+        return []
+    try:
+        found = find_terms(posterior.model, posterior.data)
+    except InputError:
+        return []
+    head = ("term", "probability", "modulus where it is there (kPa)")
+    rows = [
+        (name, f"{probability:.3f}", "{:.3g} +- {:.2g}".format(*found.moduli[name]))
+        if name in found.moduli
+        else (name, f"{probability:.3f}", "not seen")
+        for name, probability in sorted(found.probabilities.items(), key=lambda item: -item[1])
+    ]
+    told = "Which terms of the law do the data show? All sets of up to five, by their evidence."
+    if found.undecided:
+        told += f" The data do not tell of {', '.join(found.undecided)}."
+    return [parts.paragraph(told), parts.table(head, rows)]
 
 
 def _provenance(run: Run, posterior: Posterior) -> list[Markup]:

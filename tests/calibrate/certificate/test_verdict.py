@@ -3,16 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibrate.certificate.verdict import (
-    Changes,
-    Evidence,
-    Figure,
-    Physics,
-    Sampling,
-    Tail,
-    judge,
-)
-from calibrate.posterior.diagnosis import Misfit
+from calibrate.certificate.evidence import Changes, Evidence, Figure, Physics, Tail
+from calibrate.certificate.verdict import judge
+from calibrate.posterior.diagnosis import Misfit, Sampling
 
 
 def changes(shift=0.0, error=0.01, log_sd=0.0, correlation=0.0):

@@ -195,3 +195,23 @@ def test_in_a_browser(page, tmp_path):
         shown.wait_for_function(f"{find}.layout.sliders[0].active > 10")
         shown.wait_for_function(f"before => {place} !== before", arg=before)
         assert complaints == []
+
+
+def test_the_page_of_a_specimen_says_which_terms_its_law_needs():
+    stretch = np.linspace(1.02, 1.3, 8)
+    scene = em.specimen(
+        {"stretch_x": stretch, "stretch_y": stretch},
+        law=em.find_law("mooney_rivlin"),
+        parameters=tuple(em.Parameter(f"c_{k}", "kPa", 0.01, 20.0) for k in ("10", "01")),
+        constants={"kappa": 1000.0},
+    )
+    forward = em.homogeneous(scene, incompressible=True)
+    model = cal.model(forward, cal.stresses(scene, "stress_x,stress_y"), cal.GaussianNoise(sd=0.1))
+    exact = np.asarray(model.predict({"c_10": 4.0, "c_01": 0.01})[0]["stress"])
+    data = exact + 0.1 * np.random.default_rng(0).normal(size=exact.shape)
+    posterior = cal.sample(model, data, sampler="laplace", options=TINY, seed=0)
+    text = html_of(Run("biaxial.toml"), posterior, None, fem=False)
+    assert "Which terms of the law" in text
+    rows = dict(re.findall(r"<tr><td>(c_[01]+)</td><td>([0-9.]+)</td>", text))
+    assert float(rows["c_10"]) > 0.95
+    assert float(rows["c_01"]) < 0.5
