@@ -1,13 +1,18 @@
 r"""Adaptive importance sampling: few unknowns, and a forward map that is fast in batches.
 
-A population begins with draws of the prior, so that it sees all of it, and moves to the posterior
-by the steps of :mod:`calibrate.samplers.proposals`. Then a proposal :math:`q`, kernels around its
-points, is fitted, twice or more, and fresh points of the last one, drawn after it was chosen, are
+A population begins with draws of the prior, so that it sees all of it. In every step its points are
 weighted,
 
-.. math:: w_i = \frac{p(z_i)\, L(z_i)}{q(z_i)}
+.. math:: w_i = \frac{p(z_i)\, L(z_i)}{q(z_i)} ,
 
-until they are worth twice the draws asked for: :math:`n = (\sum w_i)^2 / \sum w_i^2`. The
+kernels (:mod:`calibrate.samplers.proposals`) are put around points chosen with probability
+proportional to :math:`w_i^\beta`, and fresh points are drawn from this next proposal :math:`q`.
+The power :math:`\beta` is the largest at which a given number of points counts. With an eighth of
+the points the density of a step is at most some eight times that of the one before, so that several
+modes stay in, and ten steps contract it by :math:`10^9`. Points of earlier steps are let go: the
+time of a step is the same at every contraction. At :math:`\beta = 1` the proposal is fitted, twice
+or more, and fresh points of the last one, drawn after it was chosen, are weighted until they are
+worth twice the draws asked for: :math:`n = (\sum w_i)^2 / \sum w_i^2`. The
 :math:`m` draws are resampled from these points with probability proportional to :math:`w_i`; equal
 ones occur. The variance of a mean of draws is that of the points and that of the choice among them,
 at most :math:`\sigma^2 / n + \sigma^2 / m`: the draws are worth two thirds of :math:`m` or more.
@@ -26,7 +31,7 @@ in batches, populations agree and the tail is light, and those of NUTS elsewhere
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
 import numpy as np
@@ -43,13 +48,11 @@ from calibrate.samplers.diagnostics import (
 )
 from calibrate.samplers.nuts import NUTS, NUTSOptions
 from calibrate.samplers.proposals import (
-    MOST_TEMPERED,
-    STEP,
     Kernels,
-    WeightedPoints,
     effective_number,
     key_from,
     resampled,
+    tempered,
 )
 from calibrate.samplers.protocol import Context, Draws, Options, Sampler, in_rounds
 from calibrate.samplers.smc import evidence
@@ -57,18 +60,22 @@ from calibrate.statistical_model import Data
 from emulator.core.display import counting
 from emulator.core.errors import SolverError
 
-_PRIOR = 1024  # draws of the prior that a population begins with
-_TEMPERED = 12.0  # effective points of a step, times the square of the number of unknowns
+# Effective points that the kernels of a step are put on: with more, modes far apart stay in, with
+# few unknowns fewer are enough (docs/experiments.md, "Populations that are stuck").
+_TEMPERED, _MOST_TEMPERED = 12.0, 300.0  # times the square of the number of unknowns, and at most
+_STEP = 8.0  # points of a step, for one of these
+_FEWEST = 512  # points of a step
+_PRIOR = 2.0  # draws of the prior, for one point of a step
 _FOUND = 200.0  # effective points from which a proposal is fitted
-# Evaluations by which a population has found them, or is stuck: the time of its steps grows as
-# their square (docs/experiments.md, "Populations that are stuck").
-_MOST_SEARCHED = 16_000
+_MOST_STEPS = 25
 _FITS, _MOST_FITS = 2, 6
 _LIGHT = 0.5  # Pareto shape of the weights of a good fit: their variance is finite
+_CHOSEN = 1024  # points that the kernels of a step are put around
 _FITTED_TO = 4096  # points, resampled, that a proposal is fitted to
 _FRESH = 2048  # points at a time from a fitted proposal
 _WORTH = 2.0  # independent draws that the points are worth, for one that is resampled from them
 _CENTRES, _WIDTHS, _FREEDOM = 512, (0.5, 1.0), 5.0  # of a fitted proposal
+_NARROW = (0.25, 0.5)  # of a step's: wide kernels in many dimensions undo its contraction
 
 
 @dataclass(frozen=True)
@@ -87,38 +94,24 @@ class ImportanceOptions(Options):
     rounds: int = 8
     r_hat: float = RUN_UNTIL_R_HAT
     ess: float = ENOUGH_ESS
-    evaluations: int = 100_000
+    evaluations: int = 200_000
 
     label: ClassVar[str] = "importance"
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Population(WeightedPoints):
-    """Weighted points of one population."""
+@dataclass(frozen=True, eq=False)
+class Population:
+    """Weighted points z (s, p) of one proposal.
 
-    density: Density
-    data: Data
+    at : the log prior and log likelihood of the points, (s,) each.
+    log_proposal : the log density (s,) of what the points were drawn from.
+    proposal : that, where it is no prior.
+    """
 
-    @classmethod
-    def of_prior(cls, density: Density, data: Data, rng: np.random.Generator) -> Population:
-        """Return draws of the prior."""
-        z = prior_draws(density, key_from(rng), _PRIOR)
-        return cls(
-            z=z, at=heights(density, z, data), priors=_PRIOR, log_kernels=np.zeros((0, _PRIOR)),
-            density=density, data=data,
-        )  # fmt: skip
-
-    def densities(self, z: np.ndarray) -> Heights:
-        """Return log prior and log likelihood at points z (s, p)."""
-        return heights(self.density, z, self.data)
-
-    @property
-    def most_tempered(self) -> float:
-        """The largest effective number of points that the kernels of a step are put on.
-
-        Steps contract faster with fewer; modes far apart are lost with too few.
-        """
-        return min(_TEMPERED * self.z.shape[1] ** 2, MOST_TEMPERED)
+    z: np.ndarray
+    at: Heights
+    log_proposal: np.ndarray
+    proposal: Kernels | None = None
 
     @property
     def log_posterior(self) -> np.ndarray:
@@ -128,30 +121,18 @@ class Population(WeightedPoints):
     @property
     def log_weights(self) -> np.ndarray:
         """Log weights (s,) of the posterior."""
-        return self.log_posterior - self.log_mixture
+        return self.log_posterior - self.log_proposal
 
     @property
     def log_evidence(self) -> float:
         """Logarithm of the mean weight."""
         return float(logsumexp(self.log_weights) - np.log(len(self.z)))
 
-    def refitted(
-        self, z: np.ndarray, log_weights: np.ndarray, rng: np.random.Generator
-    ) -> Population:
-        """Return fresh points from kernels around weighted points z (s, p)."""
-        rows = rng.choice(len(z), size=_FITTED_TO, p=normalised(log_weights))
-        proposal = Kernels.around(z[rows], _WIDTHS, _FREEDOM, rng, centres=_CENTRES)
-        none = replace(
-            self, z=self.z[:0], at=Heights(*(values[:0] for values in self.at)), priors=0,
-            proposals=(), counts=(), log_kernels=np.zeros((0, 0)),
-        )  # fmt: skip
-        return none.extended(proposal, _FRESH, rng)
-
-    def grown(self, rng: np.random.Generator) -> Population:
-        """Return the points with more of their one proposal."""
-        z = self.proposals[0].sample(rng, _FRESH)
-        points = self.with_points(z)
-        return replace(points, counts=(self.counts[0] + len(z),))
+    def and_more(self, other: Population) -> Population:
+        """Return the points with others of the same proposal."""
+        at = Heights(*(np.concatenate(both) for both in zip(self.at, other.at, strict=True)))
+        log_proposal = np.concatenate([self.log_proposal, other.log_proposal])
+        return Population(np.concatenate([self.z, other.z]), at, log_proposal, self.proposal)
 
 
 class _Run:
@@ -160,20 +141,30 @@ class _Run:
     def __init__(
         self, density: Density, data: Data, options: ImportanceOptions, seed: list[int]
     ) -> None:
-        self._options, self._rng = options, np.random.default_rng(seed)
-        self.evaluations = _PRIOR
-        self.points = Population.of_prior(density, data, self._rng)
+        self._density, self._data = density, data
+        self._options, self._rng, self.evaluations = options, np.random.default_rng(seed), 0
+        self._tempered = min(_TEMPERED * density.dimension**2, _MOST_TEMPERED)
+        self._step = max(round(_STEP * self._tempered), _FEWEST)
+        z = prior_draws(density, key_from(self._rng), round(_PRIOR * self._step))
+        at = self._heights(z)
+        self.points = Population(z, at, at.prior)
         if not np.isfinite(self.points.log_weights).any():
             raise SolverError("the posterior density is zero at every draw of the prior")
 
     def search(self) -> None:
         """Move from the prior to the posterior, and fit a proposal there."""
-        while True:  # one step at least: proposals are better than the prior
-            self._go_to(self.points.stepped(self.points.log_weights, self._rng), STEP)
+        for _ in range(_MOST_STEPS):  # one step at least: proposals are better than the prior
+            points = self.points
+            weights = tempered(points.log_weights, self._tempered)
+            around = points.z[self._rng.choice(len(points.z), size=_CHOSEN, p=weights)]
+            self._go_to(around, _NARROW, self._step)
             if (worth := effective_number(self.points.log_weights)) >= _FOUND:
                 break
-            if self.evaluations > _MOST_SEARCHED:
-                raise self._failure(worth)
+        else:
+            raise SolverError(
+                f"importance: the points of a population are worth {worth:.0f} draws after "
+                f"{self.evaluations} evaluations; use nuts or smc"
+            )
         for fits in range(1, _MOST_FITS + 1):
             self.fit(self.points.z, self.points.log_weights)
             if fits >= _FITS and pareto_shape(self.points.log_weights) < _LIGHT:
@@ -181,26 +172,35 @@ class _Run:
 
     def fit(self, z: np.ndarray, log_weights: np.ndarray) -> None:
         """Go to fresh points from kernels around weighted points z (s, p)."""
-        self._go_to(self.points.refitted(z, log_weights, self._rng), _FRESH)
+        around = z[self._rng.choice(len(z), size=_FITTED_TO, p=normalised(log_weights))]
+        self._go_to(around, _WIDTHS, _FRESH)
+
+    def _go_to(self, around: np.ndarray, widths: tuple[float, ...], count: int) -> None:
+        """Go to fresh points from kernels around points (s, p)."""
+        proposal = Kernels.around(around, widths, _FREEDOM, self._rng, centres=_CENTRES)
+        self.points = self._drawn(proposal, count)
+
+    def _drawn(self, proposal: Kernels, count: int) -> Population:
+        z = proposal.sample(self._rng, count)
+        return Population(z, self._heights(z), proposal.log_density(z), proposal)
+
+    def _heights(self, z: np.ndarray) -> Heights:
+        """Return log densities, which count as evaluations."""
+        self.evaluations += len(z)
+        if self.evaluations > self._options.evaluations:
+            raise SolverError(
+                f"importance: {self._options.evaluations} evaluations of a population are not "
+                "enough; use nuts or smc, or allow more evaluations"
+            )
+        return heights(self._density, z, self._data)
 
     def draw(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Return draws z (count, p) and their log posterior densities (count,)."""
         while effective_number(self.points.log_weights) < _WORTH * count:
-            self._go_to(self.points.grown(self._rng), _FRESH)
+            assert self.points.proposal is not None
+            self.points = self.points.and_more(self._drawn(self.points.proposal, _FRESH))
         rows = resampled(normalised(self.points.log_weights), count, self._rng)
         return self.points.z[rows], self.points.log_posterior[rows]
-
-    def _go_to(self, points: Population, evaluations: int) -> None:
-        """Take the points, which took so many evaluations more."""
-        self.points, self.evaluations = points, self.evaluations + evaluations
-        if self.evaluations > self._options.evaluations:
-            raise self._failure(effective_number(points.log_weights))
-
-    def _failure(self, worth: float) -> SolverError:
-        return SolverError(
-            f"importance: the points of a population are worth {worth:.0f} draws after "
-            f"{self.evaluations} evaluations; use nuts or smc, or allow more evaluations"
-        )
 
 
 def _of_all(runs: list[_Run]) -> tuple[np.ndarray, np.ndarray]:

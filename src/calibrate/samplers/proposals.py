@@ -230,11 +230,6 @@ class WeightedPoints(ABC):
         """Return the log densities ``at`` points z (s, p)."""
 
     @property
-    def most_tempered(self) -> float:
-        """The largest effective number of points that the kernels of a step are put on."""
-        return MOST_TEMPERED
-
-    @property
     def drawn(self) -> int:
         """Number of points that come from prior and proposals."""
         return self.priors + sum(self.counts)
@@ -248,7 +243,7 @@ class WeightedPoints(ABC):
 
     def stepped(self, log_weights: np.ndarray, rng: np.random.Generator) -> Self:
         """Return the points with more from kernels around those of large weight."""
-        chances = tempered(log_weights, min(TEMPERED_SHARE * len(self.z), self.most_tempered))
+        chances = tempered(log_weights, min(TEMPERED_SHARE * len(self.z), MOST_TEMPERED))
         if not chances.any():
             return self
         centres = self.z[rng.choice(len(self.z), size=_RESAMPLED, p=chances)]
