@@ -56,6 +56,14 @@ class Surface:
         return openings(self.triangles)
 
     @property
+    def normals(self) -> np.ndarray:
+        """Unit normals (n, 3) at the points, pointing out: the mean of the triangles' by area."""
+        a, b, c = np.moveaxis(self.points[self.triangles], 1, 0)
+        sums = np.zeros_like(self.points)
+        np.add.at(sums, self.triangles, np.cross(b - a, c - a)[:, None])
+        return sums / np.linalg.norm(sums, axis=1, keepdims=True)
+
+    @property
     def volume(self) -> float:
         """Enclosed with flat lids, mm3."""
         middle = self.points - self.points.mean(axis=0)

@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 from emulator.core.errors import InputError, look_up
 from emulator.geometry.discretisation import MeshQuality, discretise, mesh_quality
 from emulator.geometry.facets import MM3_PER_ML, Cavity
+from emulator.geometry.left_wall import left_wall
 from emulator.geometry.mesh import SIDES, Mesh, find_rows, orient, signed_volumes
 from emulator.geometry.refinement import to_quadratic, unfolded
 from emulator.geometry.remeshing import DiscMap, Unmeshable, tetrahedralise, triangulate
@@ -119,6 +120,7 @@ def mesh_wall(
     endocardium: str | Path | Surface,
     epicardium: str | Path | Surface,
     *,
+    right: str | Path | Surface | None = None,
     size: float | None = None,
     order: int = 2,
     axis: Sequence[float] | None = None,
@@ -132,6 +134,8 @@ def mesh_wall(
     Parameters
     ----------
     endocardium, epicardium : files of triangles (STL, PLY, OBJ), or surfaces in mm.
+    right : the right ventricle's endocardium where the epicardium wraps both ventricles; the left
+        wall ends there (:mod:`emulator.geometry.left_wall`).
     size : the edge length in mm; by default 0.7 of the median thickness, or less where the wall
         is too thin for it.
     order : 2 for quadratic elements with curved edges on both surfaces, or 1.
@@ -159,6 +163,13 @@ def mesh_wall(
         _surface(source, name, unit)
         for source, name in ((endocardium, "endocardium"), (epicardium, "epicardium"))
     ]
+    if right is not None:
+        left = left_wall(intact[0], intact[1], _surface(right, "right ventricle", unit))
+        intact[1] = left.outside
+        if axis is None:
+            axis = left.axis.tolist()
+            if base_height is None and base_point is None:
+                base_height = left.height
     normal, point = _plane(intact, axis, base_height, base_point)
     below = [cut(each, point, normal) for each in intact]
     for each in below:

@@ -121,6 +121,12 @@ _PLACE = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
 @command(
     option("--endocardium", "FILE", "triangles", required=True),
     option("--epicardium", "FILE", "triangles", required=True),
+    option(
+        "--right",
+        "FILE",
+        "right ventricle's endocardium, where the epicardium wraps both ventricles: the left wall "
+        "is cut from them",
+    ),
     option("--out", "FILE.vtu", "mesh to write, in mm", required=True),
     option(
         "--size",

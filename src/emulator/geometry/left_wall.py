@@ -1,0 +1,112 @@
+r"""The left ventricle's wall cut from a heart whose outer surface wraps both ventricles.
+
+Its outside is the epicardium on the free wall and the right ventricle's endocardium on the septum;
+where they meet, the wall goes on into the right one's. From a point x of the left endocardium with
+normal n the outside is at
+
+.. math:: x + s\,n, \qquad s = \min(h,\; c\, d),
+
+with the distance d to the nearest point of the two surfaces and the way h to where the normal meets
+one of them. The ball of radius d around x is tissue, and d changes by no more than x does, so the
+cut at the junction is even; with :math:`c = 1.3` normals go their own way elsewhere.
+
+At the valves the surfaces of a scanner meet, and the wall thins towards them. The base plane is
+across the area vector of the endocardium's openings, as high as the wall has half of its thickness.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import coo_array, diags_array
+from scipy.spatial import cKDTree
+
+from emulator.core.errors import InputError
+from emulator.geometry.mesh import SIDES
+from emulator.geometry.surfaces import Surface
+
+_FARTHEST = 1.3  # times the nearest distance
+_STEPS, _MET = 30, 0.05  # of the search along a normal, and the gap over the thickness that ends it
+_EVEN = 20  # passes that smooth normals and distances
+_THIN = 0.5  # thickness over the median of what is left of the wall at its base
+_FAR = 3.0  # median thickness over which the others are not around the endocardium, of its extent
+
+
+class LeftWall(NamedTuple):
+    """The left ventricle's part of a heart.
+
+    outside : its outer surface, with a point for each of the endocardium.
+    axis : the base plane's normal (3,), from apex to base.
+    height : the height of the base plane along it, mm.
+    """
+
+    outside: Surface
+    axis: np.ndarray
+    height: float
+
+
+def left_wall(endocardium: Surface, epicardium: Surface, right: Surface) -> LeftWall:
+    """Return the outside of the left ventricle's wall, and where its base is.
+
+    Parameters
+    ----------
+    endocardium : the left ventricle's, open at its valves. epicardium : that of both ventricles.
+    right : the right ventricle's endocardium, the septum's right side included.
+
+    :class:`InputError` for a closed endocardium, or surfaces that are not around it.
+    """
+    rims = endocardium.rims
+    if not rims:
+        raise InputError(
+            "endocardium: it is closed; cut from a heart of two ventricles it is open at its valves"
+        )
+    edges = np.concatenate(rims)
+    axis = np.cross(endocardium.points[edges[:, 0]], endocardium.points[edges[:, 1]]).sum(axis=0)
+    axis /= np.linalg.norm(axis)
+    heights = endocardium.points @ axis
+    axis, heights = (a * np.sign(heights[edges].mean() - heights.mean()) for a in (axis, heights))
+    mean, normals = _neighbours(endocardium), endocardium.normals
+    for _ in range(_EVEN):
+        normals = mean @ normals
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    others = np.vstack([epicardium.points, right.points])
+    median = float(np.median(cKDTree(others).query(endocardium.points)[0]))
+    if _FAR * median > endocardium.extent:
+        raise InputError(
+            f"the epicardium and the right ventricle are {median:.3g} mm away from the left "
+            f"endocardium, of {endocardium.extent:.3g} mm: are they of one heart, in one unit?"
+        )
+    around = [_dense(each, _MET * median) for each in (epicardium, right)]
+    tree = cKDTree(np.vstack(around), balanced_tree=False)
+    nearest = tree.query(endocardium.points)[0]
+    ways = nearest.copy()
+    for _ in range(_STEPS):  # a step of the distance to a surface never crosses it
+        gap = tree.query(endocardium.points + ways[:, None] * normals)[0]
+        going = (gap > _MET * nearest) & (ways < _FARTHEST * nearest)
+        ways = np.where(going, ways + gap, ways)
+    ways = np.minimum(ways, _FARTHEST * nearest)
+    for _ in range(_EVEN):
+        ways = np.minimum(mean @ ways, _FARTHEST * nearest)
+    outside = endocardium.points + ways[:, None] * normals
+    thin = (ways < _THIN * np.median(ways)) & (heights > heights.mean())
+    low = min(heights[edges].min(), heights[thin].min(initial=np.inf))
+    return LeftWall(Surface("epicardium", outside, endocardium.triangles), axis, float(low))
+
+
+def _neighbours(surface: Surface) -> coo_array:
+    """Return the matrix (n, n) that takes the mean over each point and its neighbours."""
+    edges = surface.triangles[:, SIDES].reshape(-1, 2)
+    count = len(surface.points)
+    pairs = np.vstack([edges, edges[:, ::-1], np.repeat(np.arange(count)[:, None], 2, axis=1)])
+    graph = (coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count)) > 0).astype(float)
+    return diags_array(1.0 / graph.sum(axis=1)) @ graph
+
+
+def _dense(surface: Surface, finest: float) -> np.ndarray:
+    """Return points of the surface, ``finest`` mm apart or nearer."""
+    corners = surface.points[surface.triangles]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max()
+    count = max(int(np.ceil(longest / finest)), 1)
+    shares = [(i, j, count - i - j) for i in range(count + 1) for j in range(count + 1 - i)]
+    return np.einsum("qa,tai->tqi", np.array(shares) / count, corners).reshape(-1, 3)
