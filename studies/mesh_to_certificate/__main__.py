@@ -38,9 +38,9 @@ VENTRICLES = {
 }
 STAGES = {
     "init": "init (a first scene file)",
-    "train": "train (21 FEM runs)",
-    "infer": "infer (NUTS, 4 x 1000)",
-    "certify": "certify (200 FEM runs)",
+    "train": "train (60 FEM runs)",
+    "infer": "infer (4 x 1000 draws)",
+    "certify": "certify (FEM runs until decided)",
     "report": "report (one HTML page)",
 }
 

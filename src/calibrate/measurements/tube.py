@@ -60,9 +60,12 @@ class OfTube(SpecimenCurves):
 
     @classmethod
     def tables(cls, words: Collection[str]) -> dict[str, Table]:
-        """Return the table of the columns of motion, and that of the measured number."""
+        """Return the table of the columns of motion and of the number; none without motion."""
         given = [w for w in words if with_unit(w)[0] == cls.column] or [cls.column]
-        columns = [*(motion_columns(words) or ["outer_radius", "stretch_axial"]), given[0]]
+        motion = motion_columns(words)
+        if not motion and cls.name not in words:  # a column 'pressure' may be of another file
+            return {}
+        columns = [*(motion or ["outer_radius", "stretch_axial"]), given[0]]
         fields = [Field(word, (word,), where=word != given[0]) for word in columns]
         return {cls.name: Table((), tuple(fields))}
 

@@ -187,3 +187,10 @@ def test_what_is_no_tube_is_refused():
     for wrong in ({"inner_radius": 0.0}, {"layers": ()}, {"opening_angle": 400.0}, {"points": 1}):
         with pytest.raises(InputError, match="tube: "):
             replace(SECTOR, **wrong)
+
+
+def test_a_column_pressure_beside_landmarks_is_no_tube(tmp_path):
+    beam = em.scenes.once_clamped_beam(cells=(2, 1, 1), order=1)
+    (tmp_path / "data.csv").write_text("node,ux,uy,uz,pressure\n3,0,0,0.1,2.0\n")
+    observe, _, _ = read_measurements(beam, tmp_path / "data.csv")
+    assert list(observe.parts) == ["displacement"]
