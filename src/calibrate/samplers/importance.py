@@ -20,9 +20,9 @@ Every weight is of the model's own density, so nothing is approximated but by th
 The mean of the weights is the evidence.
 
 Independent populations take the place of chains: their R-hat shows whether they found the same
-posterior. Where they did not, because a mode is hard to find, each is fitted once more to the
-weighted points of all. The Pareto shape of the weights' tail (Vehtari et al. 2024) shows whether
-the proposal covers it.
+posterior. Where they did not, because a mode is hard to find, or where a tail is heavy, each is
+fitted once more to the weighted points of all. The Pareto shape of the weights' tail (Vehtari et
+al. 2024) shows whether the proposal covers it.
 
 The sampler by default, ``auto``, takes these draws where unknowns are few, the forward map is fast
 in batches, populations agree and the tail is light, and those of NUTS elsewhere.
@@ -203,6 +203,11 @@ class _Run:
         return self.points.z[rows], self.points.log_posterior[rows]
 
 
+def _largest_shape(runs: list[_Run]) -> float:
+    """Return the largest Pareto shape of the weights' tail in any population."""
+    return float(np.max([pareto_shape(run.points.log_weights) for run in runs]))
+
+
 def _of_all(runs: list[_Run]) -> tuple[np.ndarray, np.ndarray]:
     """Return the points z (s, p) of all populations and their log weights (s,)."""
     populations = [run.points for run in runs]
@@ -247,13 +252,13 @@ class ImportanceSampling(Sampler):
 
             list(pool.map(search, runs))
             draws = draw(options.draws)
-            if not converged(draws.z, options.r_hat, options.ess):
+            light = _largest_shape(runs) <= LARGEST_PARETO_SHAPE
+            if not (light and converged(draws.z, options.r_hat, options.ess)):
                 z, log_weights = _of_all(runs)
                 list(pool.map(lambda run: run.fit(z, log_weights), runs))
                 draws = in_rounds(draw, options)
-        shapes = [pareto_shape(run.points.log_weights) for run in runs]
         attributes: dict[str, Any] = {
-            "weights_pareto_k": float(np.max(shapes)),
+            "weights_pareto_k": _largest_shape(runs),
             "evaluations": int(sum(run.evaluations for run in runs)),
             "effective_points": float(sum(effective_number(r.points.log_weights) for r in runs)),
             **evidence(np.array([run.points.log_evidence for run in runs])),
