@@ -97,7 +97,7 @@ def draft_specimen(
     names = {word: with_unit(word) for word in read_cells(table).words}
     measured = [w for w, (name, _) in names.items() if is_stress(w) or name in of_tube]
     if bare := [w for w in measured if not names[w][1]]:
-        notes.insert(1, f"{', '.join(bare)} without a unit: kPa, forces mN; write {bare[0]} [kPa]")
+        notes.insert(1, f"{', '.join(bare)} without a unit: kPa, forces mN; others in brackets")
     left_out = len(_every_row(table)) - len(given.free) // (tube.size if tube else 1)
     if left_out:
         notes.insert(1, f"{left_out} rows of unloading are left out")
@@ -131,7 +131,7 @@ def _size(
     """Return the largest value and the unit of each measurement, and the tissue's stiffness in kPa.
 
     A stress over the motion there, where it is largest; of a tube, the stress of a thin wall,
-    pressure times inner radius over thickness.
+    pressure times inner radius over thickness, or force over section.
     """
     neutral = specimen(
         given, law=find_law("neo_hookean_split"), tube=tube,
@@ -153,7 +153,9 @@ def _size(
     stress = np.nan_to_num(np.abs(data[first])).reshape(len(data[first]), -1).max(axis=1)
     gradients = measured_states(neutral).gradients
     if tube is not None:
-        stress = stress * tube.inner_radius / sum(tube.layers)
+        area = np.pi * (tube.outer_radius**2 - tube.inner_radius**2)
+        thin = tube.inner_radius / sum(tube.layers)
+        stress = stress * (thin if first == TubePressure.name else 1.0 / area)
     motion = np.abs(gradients).max(axis=(1, 2))
     moved = motion > 0.1 * motion.max()
     return sizes, float((stress[moved] / motion[moved]).max())
