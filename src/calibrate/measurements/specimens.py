@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping
 from functools import cached_property
 from typing import Self
@@ -41,9 +42,9 @@ class SpecimenCurves(PointObservation):
         measured_states(self.scene)  # refuses what is no specimen
         self._derive(nodes=all_nodes(self.scene))
 
+    @abstractmethod
     def _measured(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the numbers (d, c) at the displacement (n, 3) mm of all nodes."""
-        raise NotImplementedError
 
     @cached_property
     def states(self) -> States:
@@ -126,15 +127,16 @@ class SpecimenCurves(PointObservation):
 
     def motion(self) -> Block:
         """Return the columns of a data file that say how the specimen moves."""
-        arrays = {f"stretch_{a}": self.stretches[:, k] for k, a in enumerate(AXES)}
-        arrays |= {
-            f"shear_{a}{b}": self.states.gradients[:, i, j]
-            for i, a in enumerate(AXES)
-            for j, b in enumerate(AXES)
-            if i != j
-        }
         if self.scene.tube is not None:
             arrays = self.scene.tube.motion(self.stretches)
+        else:
+            arrays = {f"stretch_{a}": self.stretches[:, k] for k, a in enumerate(AXES)}
+            arrays |= {
+                f"shear_{a}{b}": self.states.gradients[:, i, j]
+                for i, a in enumerate(AXES)
+                for j, b in enumerate(AXES)
+                if i != j
+            }
         return [(Field(word, (word,)), x) for word, x in arrays.items() if np.nan_to_num(x).any()]
 
 

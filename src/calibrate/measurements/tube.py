@@ -7,8 +7,7 @@ of the pressure on closed ends; units as in ``pressure [mmHg]``, kPa and mN with
 
 from __future__ import annotations
 
-from abc import abstractmethod
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
@@ -28,12 +27,17 @@ from emulator.surrogates.homogeneous import homogeneous_stresses
 
 @dataclass(frozen=True, eq=False)
 class OfTube(SpecimenCurves):
-    """One number (d,) for each state of a tube; ``column`` and ``units`` are those of its table."""
+    """One number (d,) for each state of a tube.
+
+    A kind declares the ``column`` of its table with the ``units``, and the ``integral`` of the
+    tube over its wall.
+    """
 
     scene: Scene
 
     column: ClassVar[str]
     units: ClassVar[Mapping[str, float]]
+    integral: ClassVar[Callable[[Tube, jax.Array, jax.Array], jax.Array]]
     arguments = ()
     components = ()
 
@@ -42,21 +46,13 @@ class OfTube(SpecimenCurves):
         if self.scene.tube is None:
             raise InputError(f"scene '{self.scene.name}' is no tube, which has a {self.column}")
 
-    @property
-    def tube(self) -> Tube:
-        """The sector of the tube."""
-        assert self.scene.tube is not None
-        return self.scene.tube
-
     def _measured(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         H, P = homogeneous_stresses(self.scene, u, theta)
         F = H + jnp.eye(3)
         cauchy = jax.vmap(lambda P, F: P @ F.T / determinant(F))(P, F)
-        return self._integral(*(jnp.diagonal(a, axis1=1, axis2=2)[:, :2] for a in (F, cauchy)))
-
-    @abstractmethod
-    def _integral(self, stretches: jax.Array, cauchy: jax.Array) -> jax.Array:
-        """Return the number (d,) from what :meth:`Tube.pressure` takes."""
+        assert self.scene.tube is not None
+        in_plane = (jnp.diagonal(each, axis1=1, axis2=2)[:, :2] for each in (F, cauchy))
+        return type(self).integral(self.scene.tube, *in_plane)
 
     @classmethod
     def tables(cls, words: Collection[str]) -> dict[str, Table]:
@@ -94,9 +90,7 @@ class TubePressure(OfTube):
     unit = "kPa"
     units = IN_KPA
     other_units = {"mmHg": 0.13332239, "Pa": 1e-3, "MPa": 1e3}
-
-    def _integral(self, stretches: jax.Array, cauchy: jax.Array) -> jax.Array:
-        return self.tube.pressure(stretches, cauchy)
+    integral = Tube.pressure
 
 
 class TubeForce(OfTube):
@@ -108,6 +102,4 @@ class TubeForce(OfTube):
     unit = "mN"
     units = IN_MN
     other_units = {"N": 1e3, "gf": 9.80665}
-
-    def _integral(self, stretches: jax.Array, cauchy: jax.Array) -> jax.Array:
-        return self.tube.axial_force(stretches, cauchy)
+    integral = Tube.axial_force

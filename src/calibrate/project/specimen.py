@@ -80,12 +80,13 @@ def draft_specimen(
     if not table.is_file():
         raise InputError(f"data file {table} does not exist")
     given = read_states(table, tube)
+    count = len(given.free) // (tube.size if tube else 1)
     largest, slope = _size(table, given, tube)
     axes = [a for k, a in enumerate(AXES) if (np.abs(given.gradients[:, k, k]) > 0.0).any()]
     chosen = "holzapfel_gasser_ogden" if len(axes) > 1 else "holzapfel_ogden_isotropic"
     material = find_law(law or chosen)
     notes = [
-        f"{len(given.free) // (tube.size if tube else 1)} states in {_tests(given)}",
+        f"{count} states in {_tests(given)}",
         f"law {material.name}" + ("" if law else ": a guess, give --law NAME"),
         *(f"{name} reaches {most:.3g} {unit}" for name, (most, unit) in largest.items()),
         f"ranges of moduli follow from a stiffness of {slope:.3g} kPa",
@@ -98,7 +99,7 @@ def draft_specimen(
     measured = [w for w, (name, _) in names.items() if is_stress(w) or name in of_tube]
     if bare := [w for w in measured if not names[w][1]]:
         notes.insert(1, f"{', '.join(bare)} without a unit: kPa, forces mN; others in brackets")
-    left_out = len(_every_row(table)) - len(given.free) // (tube.size if tube else 1)
+    left_out = len(_every_row(table)) - count
     if left_out:
         notes.insert(1, f"{left_out} rows of unloading are left out")
     folder = scene_path.resolve().parent

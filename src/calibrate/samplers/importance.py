@@ -61,7 +61,7 @@ from emulator.core.display import counting
 from emulator.core.errors import SolverError
 
 # Effective points that the kernels of a step are put on: with more, modes far apart stay in, with
-# few unknowns fewer are enough (docs/experiments.md, "Populations that are stuck").
+# few unknowns fewer are enough (docs/experiments.md, "Why tempering stood still").
 _TEMPERED, _MOST_TEMPERED = 12.0, 300.0  # times the square of the number of unknowns, and at most
 _STEP = 8.0  # points of a step, for one of these
 _FEWEST = 512  # points of a step
@@ -154,10 +154,8 @@ class _Run:
     def search(self) -> None:
         """Move from the prior to the posterior, and fit a proposal there."""
         for _ in range(_MOST_STEPS):  # one step at least: proposals are better than the prior
-            points = self.points
-            weights = tempered(points.log_weights, self._tempered)
-            around = points.z[self._rng.choice(len(points.z), size=_CHOSEN, p=weights)]
-            self._go_to(around, _NARROW, self._step)
+            weights = tempered(self.points.log_weights, self._tempered)
+            self._go_to(self.points.z, weights, _CHOSEN, _NARROW, self._step)
             if (worth := effective_number(self.points.log_weights)) >= _FOUND:
                 break
         else:
@@ -172,11 +170,17 @@ class _Run:
 
     def fit(self, z: np.ndarray, log_weights: np.ndarray) -> None:
         """Go to fresh points from kernels around weighted points z (s, p)."""
-        around = z[self._rng.choice(len(z), size=_FITTED_TO, p=normalised(log_weights))]
-        self._go_to(around, _WIDTHS, _FRESH)
+        self._go_to(z, normalised(log_weights), _FITTED_TO, _WIDTHS, _FRESH)
 
-    def _go_to(self, around: np.ndarray, widths: tuple[float, ...], count: int) -> None:
-        """Go to fresh points from kernels around points (s, p)."""
+    def _go_to(
+        self, z: np.ndarray, weights: np.ndarray, chosen: int, widths: tuple[float, ...], count: int
+    ) -> None:
+        """Go to ``count`` fresh points from kernels around points z (s, p) chosen by weight."""
+        if not weights.any():
+            raise SolverError(
+                "importance: the posterior density is zero at every point of a step; use nuts"
+            )
+        around = z[self._rng.choice(len(z), size=chosen, p=weights)]
         proposal = Kernels.around(around, widths, _FREEDOM, self._rng, centres=_CENTRES)
         self.points = self._drawn(proposal, count)
 

@@ -123,7 +123,7 @@ class Tube:
         Parameters
         ----------
         columns : a radius or a diameter, and ``stretch_axial``, each (m,).
-        protocols : the name of each row's test; by default all rows are of one.
+        protocols : as of :func:`~emulator.scenes.states.states`.
         ordered : whether no test may go back.
 
         Raises

@@ -217,6 +217,13 @@ def test_points_where_the_map_has_no_answer_are_left_out():
     assert draws.z[..., 0].mean() == pytest.approx(sd * np.sqrt(2 / np.pi), rel=0.05)
 
 
+def test_a_step_without_any_answer_is_named():
+    """A density that is zero but in slits that no kernel can follow."""
+    slits = density(lambda z: jnp.where(jnp.mod(1e9 * z[0], 1.0) < 0.002, 0.0, -jnp.inf), 2)
+    with pytest.raises(SolverError, match="zero at every point of a step"):
+        sampled(slits)
+
+
 def test_the_sampler_is_that_of_the_options():
     assert find_sampler(None).name == "auto"
     assert find_sampler(None, cal.NUTSOptions()).name == "nuts"
