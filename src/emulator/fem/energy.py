@@ -201,15 +201,13 @@ def _seen_by_law(scene: Scene, H: jax.Array, barriers: Barriers | None = None) -
 
 def spring_terms(scene: Scene) -> list[LocalTerm]:
     """Return the potentials of the elastic supports."""
-    terms = (support.term(scene.discretisation) for support in scene.supports)
-    return [term for term in terms if term is not None]
+    return [t for support in scene.supports for t in support.terms(scene.discretisation)]
 
 
 def local_terms(scene: Scene) -> list[LocalTerm]:
     """Return the potentials of the loads that follow the deformation."""
     fibres = scene.fibres_of_loads
-    terms = (load.term(scene.discretisation, fibres) for load in scene.loads)
-    return [term for term in terms if term is not None]
+    return [t for load in scene.loads for t in load.terms(scene.discretisation, fibres)]
 
 
 def local_forces(scene: Scene) -> list[LocalForce]:

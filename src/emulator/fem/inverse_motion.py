@@ -277,8 +277,7 @@ class InverseSystem(System):
     def springs(self) -> list[LocalForce]:
         """Elastic supports on the loaded shape."""
         grid = self.scene.discretisation
-        forces = (support.on_loaded(grid) for support in self.scene.supports)
-        return [force for force in forces if force is not None]
+        return [force for support in self.scene.supports for force in support.on_loaded(grid)]
 
     @cached_property
     def terms(self) -> list[LocalTerm]:
@@ -294,7 +293,7 @@ class InverseSystem(System):
     def forces(self) -> list[LocalForce]:
         """Loads on the loaded shape."""
         grid, fibres = self.scene.discretisation, self.scene.fibres_of_loads
-        return [load.on_loaded(grid, fibres) for load in self.scene.loads]
+        return [force for load in self.scene.loads for force in load.on_loaded(grid, fibres)]
 
     def internal_force(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the force (n, 3) in mN of the stresses and of the springs."""

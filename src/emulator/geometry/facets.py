@@ -106,14 +106,35 @@ def enclosed_volume[A: (jax.Array, np.ndarray)](facets: np.ndarray) -> Callable[
     It is positive where the facets' own normals point out of the enclosed space. The lid of an
     opening is a fan from the mean of its rim's corners; ``x`` is (..., n, 3) in mm.
     """
-    rims = [(edges, np.unique(edges[:, :2])) for edges in openings(facets)]
+    rims = lids(facets)
 
     def volume(x: A) -> A:
         total = cone_volume(x[..., facets, :]).sum(-1)
-        for edges, ends in rims:
-            lids = _lids(x[..., edges, :], x[..., ends, :].mean(-2))
-            total = total + cone_volume(lids).sum(-1)
+        for nodes, cone in rims:
+            total = total + cone(x[..., nodes, :])
         return total
+
+    return volume
+
+
+def lids[A: (jax.Array, np.ndarray)](
+    facets: np.ndarray,
+) -> list[tuple[np.ndarray, Callable[[A], A]]]:
+    """Return the lid of each opening of ``facets`` (k, 3 or 6), facing as they do.
+
+    For each the nodes (r,) of the rim, and ``x -> V``, the signed volume (...) mm3 between the
+    origin and the lid at the rim's places x (..., r, 3) mm.
+    """
+    return [(np.unique(edges), _cone_over(edges)) for edges in openings(facets)]
+
+
+def _cone_over[A: (jax.Array, np.ndarray)](edges: np.ndarray) -> Callable[[A], A]:
+    nodes, rows = np.unique(edges, return_inverse=True)
+    rows = rows.reshape(edges.shape)
+    ends = np.searchsorted(nodes, np.unique(edges[:, :2]))
+
+    def volume(x: A) -> A:
+        return cone_volume(_lids(x[..., rows, :], x[..., ends, :].mean(-2))).sum(-1)
 
     return volume
 

@@ -150,6 +150,10 @@ class Depth(NamedTuple):
     normal: np.ndarray
 
 
+BOTH = ("lv_endocardium", "rv_endocardium", "epicardium")
+"""Facet sets of the walls of two ventricles."""
+
+
 def biventricular_depth(mesh: Mesh) -> Depth:
     """Return the depth in the walls of two ventricles; the left one's governs the septum.
 
@@ -158,10 +162,9 @@ def biventricular_depth(mesh: Mesh) -> Depth:
     the point lies in the right ventricle's free wall and depth runs from rv_endocardium to the
     other two surfaces; elsewhere depth runs from lv_endocardium to the other two.
     """
-    surfaces = ("lv_endocardium", "rv_endocardium", "epicardium")
     left, right = (
-        wall_depth(mesh, (name,), tuple(other for other in surfaces if other != name))
-        for name in surfaces[:2]
+        wall_depth(mesh, (name,), tuple(other for other in BOTH if other != name))
+        for name in BOTH[:2]
     )
     touch_left, touch_right = 1.0 - left.value, 1.0 - right.value
     touch_outside = 1.0 - touch_left - touch_right

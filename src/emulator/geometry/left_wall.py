@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 
 from emulator.core.errors import InputError
 from emulator.geometry.mesh import SIDES
-from emulator.geometry.surfaces import Surface
+from emulator.geometry.surfaces import Surface, sampled
 
 _FARTHEST = 1.3  # times the nearest distance
 _STEPS, _MET = 30, 0.05  # of the search along a normal, and the gap over the thickness that ends it
@@ -77,7 +77,7 @@ def left_wall(endocardium: Surface, epicardium: Surface, right: Surface) -> Left
             f"the epicardium and the right ventricle are {median:.3g} mm away from the left "
             f"endocardium, of {endocardium.extent:.3g} mm: are they of one heart, in one unit?"
         )
-    around = [_dense(each, _MET * median) for each in (epicardium, right)]
+    around = [sampled(each, each.points, _MET * median) for each in (epicardium, right)]
     tree = cKDTree(np.vstack(around), balanced_tree=False)
     nearest = tree.query(endocardium.points)[0]
     ways = nearest.copy()
@@ -101,12 +101,3 @@ def _neighbours(surface: Surface) -> coo_array:
     pairs = np.vstack([edges, edges[:, ::-1], np.repeat(np.arange(count)[:, None], 2, axis=1)])
     graph = (coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count)) > 0).astype(float)
     return diags_array(1.0 / graph.sum(axis=1)) @ graph
-
-
-def _dense(surface: Surface, finest: float) -> np.ndarray:
-    """Return points of the surface, ``finest`` mm apart or nearer."""
-    corners = surface.points[surface.triangles]
-    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max()
-    count = max(int(np.ceil(longest / finest)), 1)
-    shares = [(i, j, count - i - j) for i in range(count + 1) for j in range(count + 1 - i)]
-    return np.einsum("qa,tai->tqi", np.array(shares) / count, corners).reshape(-1, 3)

@@ -1,7 +1,8 @@
 r"""Even triangles on a cup-like surface, and triangles and tetrahedra by Gmsh (extra ``gmsh``).
 
-A surface with one rim is mapped to the unit disc. The rim goes to the circle by its arc length;
-every other point lies at the weighted mean of its neighbours,
+A surface is mapped to the unit disc. Its longest rim goes to the circle by its arc length; other
+openings are filled by fans for the map. Every other point lies at the weighted mean of its
+neighbours,
 
 .. math:: \sum_j w_{ij} (u_j - u_i) = 0, \qquad
           w_{ij} = \frac{\tan(\alpha_{ij}/2) + \tan(\beta_{ij}/2)}{|x_j - x_i|},
@@ -21,7 +22,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
@@ -31,7 +32,7 @@ from scipy.spatial import cKDTree
 
 from emulator.core.errors import InputError
 from emulator.geometry.mesh import cross_sides
-from emulator.geometry.surfaces import Surface, one_rim, signed_areas
+from emulator.geometry.surfaces import Surface, closed, one_rim, rim_loops, signed_areas
 
 _TYPES = {3: 2, 4: 4}  # Gmsh's numbers of element types, by their corners
 
@@ -145,67 +146,111 @@ def _model() -> Iterator[Any]:
 _HALVINGS = 30  # of an interval, until the middle of an edge is known to round-off
 
 
-class DiscMap:
-    """The map from the unit disc to a surface with one rim; :class:`InputError` for another number.
+class Remeshed(NamedTuple):
+    """Even triangles on a surface.
 
-    surface : in mm. length : of its rim, mm. places : of its points in the disc, (n, 2).
+    surface : the triangles. places : their points (n, 2) in the disc.
+    turns : for each rim the share of its length (k,) at which its points are; they come first, rim
+        by rim and in order.
+    """
+
+    surface: Surface
+    places: np.ndarray
+    turns: tuple[np.ndarray, ...]
+
+    @property
+    def loops(self) -> list[np.ndarray]:
+        """The points (k,) of each rim, in order."""
+        ends = np.cumsum([len(each) for each in self.turns])
+        return [np.arange(end - len(own), end) for end, own in zip(ends, self.turns, strict=True)]
+
+
+class Rim(NamedTuple):
+    """A rim as a closed curve: its first point stands at its end, too.
+
+    along : the length (k + 1,) up to each point, over the whole. points : (k + 1, 3) mm.
+    places : (k + 1, 2) in the disc. length : of the whole, mm.
+    """
+
+    along: np.ndarray
+    points: np.ndarray
+    places: np.ndarray
+    length: float
+
+    def at(self, turn: np.ndarray) -> np.ndarray:
+        """Return points (..., 3) mm at shares ``turn`` (...) of the length."""
+        return self._between(self.points, turn)
+
+    def place(self, turn: np.ndarray) -> np.ndarray:
+        """Return places (..., 2) in the disc at shares ``turn`` (...) of the length."""
+        return self._between(self.places, turn)
+
+    def _between(self, values: np.ndarray, turn: np.ndarray) -> np.ndarray:
+        share = np.mod(turn, 1.0)
+        return np.stack([np.interp(share, self.along, x) for x in values.T], axis=-1)
+
+
+class DiscMap:
+    """The map from the unit disc to a surface; :class:`InputError` for a closed one.
+
+    Its longest rim is the circle. Other rims are holes in the disc.
+
+    surface : in mm. places : of its points in the disc, (n, 2). rims : the longest one first.
     """
 
     def __init__(self, surface: Surface) -> None:
         self.surface = surface
-        edges = one_rim(surface)
-        successor = dict(edges.tolist())
-        loop = [int(edges[0, 0])]
-        while (next_one := successor[loop[-1]]) != loop[0]:
-            loop.append(next_one)
-        closed = surface.points[[*loop, loop[0]]]
-        self._along = np.concatenate(
-            [[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))]
-        )
-        self._rim = closed
-        self.length = float(self._along[-1])
-        turn = 2.0 * np.pi * self._along[:-1] / self.length
-        weights = _mean_value_weights(surface)
-        self.places = np.zeros((len(surface.points), 2))
-        self.places[loop] = np.column_stack([np.cos(turn), np.sin(turn)])
-        free = np.setdiff1d(np.arange(len(surface.points)), loop)
+        loops = rim_loops(surface)
+        if not loops:
+            one_rim(surface)
+        whole = closed(surface, loops[1:])
+        curves = [surface.points[[*loop, loop[0]]] for loop in loops]
+        steps = [np.linalg.norm(np.diff(each, axis=0), axis=1) for each in curves]
+        along = [np.concatenate([[0.0], np.cumsum(each)]) for each in steps]
+        turn = 2.0 * np.pi * along[0][:-1] / along[0][-1]
+        places = np.zeros((len(whole.points), 2))
+        places[loops[0]] = np.column_stack([np.cos(turn), np.sin(turn)])
+        weights = _mean_value_weights(whole)
+        free = np.setdiff1d(np.arange(len(whole.points)), loops[0])
         rows = (diags_array(weights.sum(axis=1)) - weights).tocsr()[free]
-        self.places[free] = spsolve(rows[:, free].tocsc(), -(rows[:, loop] @ self.places[loop]))
+        places[free] = spsolve(rows[:, free].tocsc(), -(rows[:, loops[0]] @ places[loops[0]]))
+        self._whole, self._places = whole, places
+        self.places = places[: len(surface.points)]
+        self.rims = [
+            Rim(s / s[-1], points, places[[*loop, loop[0]]], float(s[-1]))
+            for s, points, loop in zip(along, curves, loops, strict=True)
+        ]
 
     @cached_property
     def _inside(self) -> LinearNDInterpolator:
-        return LinearNDInterpolator(self.places, self.surface.points)
-
-    def rim_at(self, turn: np.ndarray) -> np.ndarray:
-        """Return points (..., 3) mm of the rim at angles ``turn`` (...) of the circle."""
-        along = np.mod(turn / (2.0 * np.pi), 1.0) * self.length
-        return np.stack([np.interp(along, self._along, x) for x in self._rim.T], axis=-1)
+        return LinearNDInterpolator(self._places, self._whole.points)
 
     def at(self, places: np.ndarray) -> np.ndarray:
         """Return points (k, 3) mm of the surface at ``places`` (k, 2); off the disc, of the rim."""
         points = self._inside(places)
         off = np.isnan(points).any(axis=1)
-        points[off] = self.rim_at(np.arctan2(places[off, 1], places[off, 0]))
+        angles = np.arctan2(places[off, 1], places[off, 0])
+        points[off] = self.rims[0].at(angles / (2.0 * np.pi))
         return points
 
-    def remeshed(self, size: float) -> tuple[Surface, np.ndarray]:
-        """Return triangles with edges of about ``size`` mm, and their points (n, 2) in the disc.
-
-        Points of the rim come first, in its order.
-        """
-        count = max(6, round(self.length / size))
-        turn = 2.0 * np.pi * np.arange(count) / count
-        polygon = np.column_stack([np.cos(turn), np.sin(turn)])
+    def remeshed(self, size: float) -> Remeshed:
+        """Return triangles with edges of about ``size`` mm."""
+        counts = [max(6, round(rim.length / size)) for rim in self.rims]
+        turns = [np.arange(count) / count for count in counts]
+        circle = 2.0 * np.pi * turns[0]
+        polygons = [np.column_stack([np.cos(circle), np.sin(circle)])]
+        polygons += [rim.place(own) for rim, own in zip(self.rims[1:], turns[1:], strict=True)]
         nearest, stretch = cKDTree(self.places, balanced_tree=False), self._stretch()
-        places, rows = triangulate([polygon], lambda x, y: size / stretch[nearest.query((x, y))[1]])
+        places, rows = triangulate(polygons, lambda x, y: size / stretch[nearest.query((x, y))[1]])
         points = self.at(places)
-        points[:count] = self.rim_at(turn)
+        on_rims = [rim.at(own) for rim, own in zip(self.rims, turns, strict=True)]
+        points[: sum(counts)] = np.concatenate(on_rims)
         now, before = (
             np.sign(np.sum(signed_areas(corners)))
             for corners in (places[rows], self.places[self.surface.triangles])
         )
         rows = rows if now == before else rows[:, ::-1]
-        return Surface(self.surface.name, points, rows), places
+        return Remeshed(Surface(self.surface.name, points, rows), places, tuple(turns))
 
     def _stretch(self) -> np.ndarray:
         """Return lengths on the surface over those in the disc, (n,), from areas around points."""
@@ -219,12 +264,12 @@ class DiscMap:
         around = [np.bincount(rows.ravel(), each[rows].sum(1).repeat(3)) for each in areas]
         return np.sqrt(around[0] / np.maximum(around[1], 1e-30))
 
-    def middles(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
-        """Return points (k, 3) mm on the surface, equally far from both given places (k, 2).
+    def middles(self, new: Remeshed, edges: np.ndarray) -> np.ndarray:
+        """Return points (k, 3) mm on the surface, equally far from both ends of ``edges`` (k, 2).
 
-        Along the straight line between them in the disc; between two places on the circle, along
-        the rim.
+        Along the straight line between them in the disc; between neighbours on a rim, along it.
         """
+        one, other = new.places[edges[:, 0]], new.places[edges[:, 1]]
         first, last = self.at(one), self.at(other)
         low, high = np.zeros(len(one)), np.ones(len(one))
         for _ in range(_HALVINGS):
@@ -233,9 +278,13 @@ class DiscMap:
             closer_to_first = np.sum((points - first) ** 2 - (points - last) ** 2, axis=1) < 0.0
             low = np.where(closer_to_first, share, low)
             high = np.where(closer_to_first, high, share)
-        on_rim = np.all([np.linalg.norm(p, axis=1) > 1.0 - 1e-9 for p in (one, other)], axis=0)
-        x, y = (one + other)[on_rim].T
-        points[on_rim] = self.rim_at(np.arctan2(y, x))
+        for rim, loop in zip(self.rims, new.loops, strict=True):
+            count = len(loop)
+            a, b = (edges - loop[0]).T
+            on_it = ((edges >= loop[0]) & (edges <= loop[-1])).all(axis=1)
+            on_it &= np.isin(np.abs(a - b), (1, count - 1))
+            start = np.where(np.abs(a - b) == 1, np.minimum(a, b), count - 1)
+            points[on_it] = rim.at((start[on_it] + 0.5) / count)
         return points
 
 

@@ -12,7 +12,7 @@ with ``L x`` the neighbours' mean less ``x``, so that steps of voxels go and the
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -61,7 +61,13 @@ class Surface:
         a, b, c = np.moveaxis(self.points[self.triangles], 1, 0)
         sums = np.zeros_like(self.points)
         np.add.at(sums, self.triangles, np.cross(b - a, c - a)[:, None])
-        return sums / np.linalg.norm(sums, axis=1, keepdims=True)
+        return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-300)
+
+    @property
+    def area(self) -> float:
+        """Area of the triangles, mm2."""
+        a, b, c = np.moveaxis(self.points[self.triangles], 1, 0)
+        return 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
 
     @property
     def volume(self) -> float:
@@ -177,6 +183,14 @@ def cut(surface: Surface, point: np.ndarray, normal: np.ndarray) -> Surface:
         )
     flat = surface.points - np.outer((surface.points - point) @ normal, normal)
     points = np.where((height == 0.0)[:, None], flat, surface.points)
+    below_it = clipped(Surface(surface.name, points, surface.triangles), height)
+    one_rim(below_it, is_cut=True)
+    return below_it
+
+
+def clipped(surface: Surface, height: np.ndarray) -> Surface:
+    """Return the part of a surface where ``height`` (n,), linear in each triangle, is below 0."""
+    points = surface.points
     sign = np.sign(height).astype(int)[surface.triangles]
     below = (sign <= 0).all(axis=1) & (sign < 0).any(axis=1)
     rows = surface.triangles[below].tolist()
@@ -197,9 +211,7 @@ def cut(surface: Surface, point: np.ndarray, normal: np.ndarray) -> Surface:
         rows += [(polygon[0], polygon[k], polygon[k + 1]) for k in range(1, len(polygon) - 1)]
     vertices, numbered = np.unique(rows, return_inverse=True)
     places = np.concatenate([points, np.array(new).reshape(-1, 3)])[vertices]
-    below_it = Surface(surface.name, places, numbered.reshape(-1, 3))
-    one_rim(below_it, is_cut=True)
-    return below_it
+    return Surface(surface.name, places, numbered.reshape(-1, 3))
 
 
 def one_rim(surface: Surface, is_cut: bool = False) -> np.ndarray:
@@ -275,6 +287,77 @@ def inside(surface: Surface, points: np.ndarray, axis: np.ndarray) -> np.ndarray
     height = np.einsum("ka,ka->k", weights, corners[row[hits], :, 2])
     below = height < at[point[hits], 2]
     return np.bincount(point[hits][below], minlength=len(at)) % 2 == 1
+
+
+def closed(surface: Surface, loops: Sequence[np.ndarray] | None = None) -> Surface:
+    """Return the surface with a fan over each opening, or over those with rims ``loops`` (k,).
+
+    Each fan is from the middle of its rim, a point that is added.
+    """
+    points, rows = [surface.points], [surface.triangles]
+    for k, loop in enumerate(rim_loops(surface) if loops is None else loops):
+        points.append(surface.points[loop].mean(axis=0, keepdims=True))
+        middle = np.full(len(loop), len(surface.points) + k)
+        rows.append(np.column_stack([np.roll(loop, -1), loop, middle]))
+    return Surface(surface.name, np.concatenate(points), np.concatenate(rows))
+
+
+def rim_loops(surface: Surface) -> list[np.ndarray]:
+    """Return the points (k,) of each rim in order, the longest rim first."""
+    loops = []
+    for edges in surface.rims:
+        successor = dict(edges.tolist())
+        loop = [int(edges[0, 0])]
+        while (next_one := successor[loop[-1]]) != loop[0]:
+            loop.append(next_one)
+        loops.append(np.array(loop))
+    return sorted(loops, key=lambda loop: -_perimeter(surface.points[loop]))
+
+
+def _perimeter(polygon: np.ndarray) -> float:
+    """Return the length in mm of a closed polygon (k, 3)."""
+    return float(np.linalg.norm(polygon - np.roll(polygon, 1, axis=0), axis=1).sum())
+
+
+def area_vector(polygon: np.ndarray) -> np.ndarray:
+    """Return the area vector (3,) mm2 of a closed polygon (k, 3)."""
+    middle = polygon - polygon.mean(axis=0)
+    return 0.5 * np.cross(middle, np.roll(middle, -1, axis=0)).sum(axis=0)
+
+
+def sampled(surface: Surface, values: np.ndarray, finest: float) -> np.ndarray:
+    """Return ``values`` (n, 3) of the points at places of each triangle, ``finest`` mm apart."""
+    corners = surface.points[surface.triangles]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max()
+    count = max(int(np.ceil(longest / finest)), 1)
+    shares = [(i, j, count - i - j) for i in range(count + 1) for j in range(count + 1 - i)]
+    at_places = np.array(shares) / count
+    return np.einsum("qa,tai->tqi", at_places, values[surface.triangles]).reshape(-1, 3)
+
+
+def crossings(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return edges (c, 2) and triangles (c, 3) that they go through, without a common corner."""
+    edges = np.unique(np.sort(triangles[:, SIDES].reshape(-1, 2), axis=1), axis=0)
+    middles, centres = points[edges].mean(axis=1), points[triangles].mean(axis=1)
+    reach = np.linalg.norm(points[triangles] - centres[:, None], axis=-1).max()
+    reach += 0.5 * np.linalg.norm(points[edges[:, 1]] - points[edges[:, 0]], axis=1).max()
+    near = cKDTree(centres, balanced_tree=False).query_ball_point(middles, reach)
+    edge = np.repeat(np.arange(len(edges)), [len(rows) for rows in near])
+    row = np.concatenate([np.asarray(rows, dtype=np.int64) for rows in near])
+    apart = (edges[edge][:, :, None] != triangles[row][:, None]).all(axis=(1, 2))
+    edge, row = edges[edge[apart]], triangles[row[apart]]
+    a, b, c = np.moveaxis(points[row], 1, 0)
+    ends, normal = points[edge], np.cross(b - a, c - a)
+    low, high = np.einsum("cei,ci->ec", ends - a[:, None], normal)
+    through = low * high < 0.0
+    edge, row, ends, normal = edge[through], row[through], ends[through], normal[through]
+    share = (low[through] / (low - high)[through])[:, None]
+    place = ends[:, 0] + share * (ends[:, 1] - ends[:, 0])
+    corners = points[row]
+    sides = np.roll(corners, -1, axis=1) - corners
+    turn = np.cross(sides, place[:, None] - corners)
+    hit = (np.einsum("csi,ci->cs", turn, normal) > 0.0).all(axis=1)
+    return edge[hit], row[hit]
 
 
 def axes_across(normal: np.ndarray) -> np.ndarray:

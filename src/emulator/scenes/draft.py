@@ -20,13 +20,14 @@ import numpy as np
 from emulator.core.errors import InputError, look_up
 from emulator.geometry.discretisation import mesh_quality
 from emulator.geometry.facets import mean_normal
+from emulator.geometry.fibres import BOTH
 from emulator.geometry.io import Body, read_body, write_mesh
 from emulator.geometry.mesh import EDGES, Mesh, cross_sides
 from emulator.geometry.surfaces import UNITS
 from emulator.mechanics.laws import find_law
 from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.file import read_scene
-from emulator.scenes.loads import CavityPressure, FollowerPressure, Gravity, Load
+from emulator.scenes.loads import CavityPressure, FollowerPressure, Gravity, Load, SurfacePressure
 from emulator.scenes.scene import Scene
 from emulator.scenes.supports.dirichlet import Support, loose_parts
 
@@ -56,6 +57,7 @@ _RANGES = {
     "lam": (3.5, 10.0),
     "C": (1.0, 4.0),
     "pressure": (0.53, 1.33),
+    "right_pressure": (0.1, 0.4),
 }
 _CONSTANTS = {"kappa": 25.0}
 _MODULUS, _NUMBER = (1.0, 10.0), (1.0, 5.0)
@@ -143,8 +145,9 @@ def draft_scene(
     sections = ["\n".join(head)]
     if material.fibres and body.fibres is None:
         sections.append(_fibres(mesh, walls, material.sheets))
-    for load, lines, note, stiffer in _loads(mesh):
-        quantities = _quantities([*material.quantities, *load.quantities], stiffer)
+    for loads, lines, note, stiffer in _loads(mesh):
+        of_loads = [quantity for load in loads for quantity in load.quantities]
+        quantities = _quantities([*material.quantities, *of_loads], stiffer)
         entries = "\n\n".join([*sections, support, lines, *quantities]) + "\n"
         all_notes = (*notes, note, *_unused(mesh, entries))
         out.write_text(_header(mesh, all_notes) + entries, encoding="utf-8")
@@ -153,7 +156,7 @@ def draft_scene(
         except InputError as error:
             out.unlink()
             failure = re.sub(rf"^scene file {re.escape(str(out))}(, line \d+)?: ", "", str(error))
-        notes.append(f"not the load '{load.kind}': {failure}")
+        notes.append(f"not the load '{loads[0].kind}': {failure}")
     if mesh_name == f"{mesh_path.stem}_mm.vtu" and unit != "mm":
         out.with_name(mesh_name).unlink()
     raise InputError(f"mesh file {mesh_path}: {failure}")
@@ -214,6 +217,9 @@ def _fibres(mesh: Mesh, walls: tuple[str, str] | None, with_sheets: bool) -> str
         # Rounded, so that a base that is level to round-off gives a level axis, without -0.
         normal = (np.round(mean_normal(mesh.nodes[mesh.facet_set(base)]), 6) + 0.0).tolist()
         axis = f"axis = {normal}   # from apex to base, across '{base}'"
+    if _of_both(mesh):
+        angles = "angles = [60.0, -60.0]   # degrees, inside and outside"
+        return f'[fibres]\nrule = "biventricle"\n{angles}\n{axis}'
     return f"""[fibres]
 rule = "helix"
 angles = [60.0, -60.0]   # degrees, inside and outside
@@ -290,24 +296,40 @@ def _end(mesh: Mesh, nodes: np.ndarray) -> tuple[str, float | list[float], str]:
     return "xyz"[longest], [low, high], f"between {low:.6g} and {high:.6g}"
 
 
-def _loads(mesh: Mesh) -> list[tuple[Load, str, str, float]]:
-    """Return the loads to try, each with its lines, a note, and by how much moduli are raised.
+def _loads(mesh: Mesh) -> list[tuple[list[Load], str, str, float]]:
+    """Return the loads to try, with their lines, a note, and by how much moduli are raised.
 
     Under its own weight, they are raised so that a beam of the body's size stands it.
     """
-    loads: list[tuple[Load, str, str, float]] = []
+    loads: list[tuple[list[Load], str, str, float]] = []
     wall = _find_wall(mesh, _INSIDE)
     if wall is not None:
         for kind in (CavityPressure, FollowerPressure):
-            lines = f'[[loads]]\nkind = "{kind.kind}"\nfacet_set = {_quoted(wall)}\n'
-            lines += "# pressure = 0.8   # kPa; without it, a parameter"
-            loads.append((kind(wall), lines, f"pressure on '{wall}'", 1.0))
+            pressures = [kind(wall)]
+            if _of_both(mesh):
+                pressures.append(kind(BOTH[1], parameter="right_pressure"))
+            lines = "\n\n".join(map(_pressure, pressures))
+            note = " and ".join(f"'{each.facet_set}'" for each in pressures)
+            loads.append(([*pressures], lines, f"pressure on {note}", 1.0))
     gravity = f'[[loads]]   # CHANGE\nkind = "{Gravity.kind}"\ndensity = 1.06   # g/cm3\n'
     note = "its own weight along -z is the load; change it if you know another"
     extent = np.ptp(mesh.nodes, axis=0)
     stress = 3.0 * _WEIGHT * extent.max() ** 2 / extent.min()
     stiffer = max(1.0, float(f"{stress / _MOST_STRESS:.1g}"))
-    return [*loads, (Gravity(), gravity + "direction = [0.0, 0.0, -1.0]", note, stiffer)]
+    return [*loads, ([Gravity()], gravity + "direction = [0.0, 0.0, -1.0]", note, stiffer)]
+
+
+def _pressure(load: SurfacePressure) -> str:
+    """Return the lines of a pressure."""
+    lines = f'[[loads]]\nkind = "{load.kind}"\nfacet_set = {_quoted(load.facet_set)}\n'
+    if load.parameter != SurfacePressure.parameter:
+        lines += f'parameter = "{load.parameter}"\n'
+    return lines + "# pressure = 0.8   # kPa; without it, a parameter"
+
+
+def _of_both(mesh: Mesh) -> bool:
+    """Return whether the mesh has the walls of both ventricles, under the names of their rule."""
+    return set(BOTH) <= set(mesh.facet_sets)
 
 
 def _quantities(quantities: Sequence[Quantity], stiffer: float) -> list[str]:
@@ -323,7 +345,7 @@ def _quantities(quantities: Sequence[Quantity], stiffer: float) -> list[str]:
         if not quantity.low < low < high < quantity.high:
             span = quantity.high - quantity.low
             low, high = quantity.low + 0.25 * span, quantity.low + 0.75 * span
-        scale = '\nscale = "log"' if low > 0.0 and quantity.name != "pressure" else ""
+        scale = '\nscale = "log"' if low > 0.0 and "pressure" not in quantity.name else ""
         sections.append(
             f'[parameters.{quantity.name}]\nunit = "{quantity.unit}"\n'
             f"range = [{low}, {high}]   # CHANGE: what you think possible{scale}"

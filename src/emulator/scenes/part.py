@@ -181,8 +181,8 @@ class Load(Part):
         """
         return {}
 
-    def term(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalTerm | None:
-        """Return the potential of a load that follows the deformation, or None.
+    def terms(self, grid: Discretisation, fibres: Fibres | None = None) -> tuple[LocalTerm, ...]:
+        """Return the potentials of a load that follows the deformation.
 
         Parameters
         ----------
@@ -190,7 +190,7 @@ class Load(Part):
             is an unknown.
         fibres : the fibres of the tissue, traced too; None in a scene without.
         """
-        return None
+        return ()
 
     def force(self, grid: Discretisation) -> LocalForce | None:
         """Return the force of a load that follows the deformation without a potential, or None."""
@@ -202,10 +202,12 @@ class Load(Part):
         """Return the stress (m, q, 3, 3) in kPa added to the law's at F (m, q, 3, 3), or None."""
         return None
 
-    def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
-        """Return the force on a body whose *loaded* shape is the mesh, in the inverse problem.
+    def on_loaded(
+        self, grid: Discretisation, fibres: Fibres | None = None
+    ) -> tuple[LocalForce, ...]:
+        """Return the forces on a body whose *loaded* shape is the mesh, in the inverse problem.
 
-        The local displacements of the force are those of w, from the loaded to the stress-free
+        The local displacements of the forces are those of w, from the loaded to the stress-free
         shape (:mod:`emulator.fem.inverse_motion`). A force per volume or area of the stress-free
         body depends on w; one that follows the surface does not.
 
@@ -279,13 +281,13 @@ class BoundaryCondition(Part):
         """Return prescribed displacements, or None."""
         return None
 
-    def term(self, grid: Discretisation) -> LocalTerm | None:
-        """Return the potential of the springs, or None."""
-        return None
+    def terms(self, grid: Discretisation) -> tuple[LocalTerm, ...]:
+        """Return the potentials of the springs."""
+        return ()
 
-    def on_loaded(self, grid: Discretisation) -> LocalForce | None:
-        """Return the force of the springs as :meth:`Load.on_loaded` does, or None."""
-        return None
+    def on_loaded(self, grid: Discretisation) -> tuple[LocalForce, ...]:
+        """Return the forces of the springs as :meth:`Load.on_loaded` does."""
+        return ()
 
     def on_finer(
         self, mesh: Mesh, displacements: Mapping[str | None, np.ndarray]

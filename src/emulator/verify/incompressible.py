@@ -183,7 +183,7 @@ def verify_pressure_work() -> list[Benchmark]:
 def _work_ratio(load: CavityPressure | PublishedPressure, stretch: float) -> float:
     """Return the derivative of the load's work in a uniform ``stretch``, over ``p dV``."""
     scene = replace(sphere_scene((4, 2), order=1), loads=(load,))
-    term = load.term(scene.discretisation)
+    (term,) = load.terms(scene.discretisation)
     X = jnp.asarray(scene.mesh.nodes)
     derivative = jax.grad(lambda value: term.total((value - 1.0) * X, {"pressure": jnp.ones(())}))
     facets = scene.mesh.nodes[scene.mesh.facet_set("inner")]

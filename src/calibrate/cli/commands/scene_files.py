@@ -124,8 +124,13 @@ _PLACE = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
     option(
         "--right",
         "FILE",
-        "right ventricle's endocardium, where the epicardium wraps both ventricles: the left wall "
-        "is cut from them",
+        "right ventricle's endocardium, where the epicardium wraps both ventricles",
+    ),
+    option(
+        "--ventricles",
+        choices=("both", "left"),
+        default="both",
+        help="of a heart with --right: mesh both, or the left wall alone (default: both)",
     ),
     option("--out", "FILE.vtu", "mesh to write, in mm", required=True),
     option(
@@ -151,15 +156,17 @@ _PLACE = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
     ),
     option("--unit", "mm|cm|m|um", "of the surfaces' coordinates (default: mm)", default="mm"),
     option("--picture", "FILE.png", "the mesh, by the wall's thickness"),
-    help="tetrahedra between the two surfaces of a left ventricle",
+    help="tetrahedra between the surfaces of a left ventricle, or of both",
     description="Cuts both surfaces at the base, meshes the wall between them by Gmsh and "
     "names endocardium, epicardium and base, for calibrate init. Surfaces are STL, PLY, OBJ or "
-    "VTK's PolyData: open at the base, or closed, with --axis and a base plane.",
+    "VTK's PolyData: open at the base, or closed, with --axis and a base plane. With --right, both "
+    "ventricles are meshed, open at their valves.",
     epilog="example: calibrate mesh --endocardium endo.stl --epicardium epi.stl --out lv.vtu, "
     "then calibrate init lv.vtu",
 )
 def mesh(arguments: Namespace) -> Answer:
     """Mesh the wall, and write the mesh and its picture."""
+    from emulator.geometry.heart import mesh_heart
     from emulator.geometry.io import write_mesh
     from emulator.geometry.two_surfaces import mesh_wall
 
@@ -167,12 +174,11 @@ def mesh(arguments: Namespace) -> Answer:
     words.check_vtu(out)
     if picture is not None:
         check_folder(Path(picture).parent)
-    wall = mesh_wall(**words.parameters(mesh_wall, arguments))
+    both = arguments.right is not None and arguments.ventricles == "both"
+    make = mesh_heart if both else mesh_wall
+    wall = make(**words.parameters(make, arguments))
     write_mesh(out, wall.mesh)
-    pairs = {
-        name: dict(zip(("mesh", "surface"), getattr(wall, name), strict=True))
-        for name in ("cavity", "wall")
-    }
+    names = ("mesh", "surface")
     result = {
         "out": out,
         "nodes": len(wall.mesh.nodes),
@@ -181,7 +187,10 @@ def mesh(arguments: Namespace) -> Answer:
         "axis": wall.axis,
         "base": wall.base,
         "thickness": wall.thickness._asdict(),
-        **pairs,
+        "cavities": {
+            name: dict(zip(names, own, strict=True)) for name, own in wall.cavities.items()
+        },
+        "wall": dict(zip(names, wall.wall, strict=True)),
         **dict(zip(("cut_off", "cut_off_ml"), wall.cut_off, strict=True)),
         "moved": wall.moved,
         "folded": wall.folded[0],

@@ -13,6 +13,7 @@ from emulator.scenes.loads.pressure import (
     FollowerPressure,
     PublishedPressure,
     SurfacePressure,
+    ValvePressure,
 )
 from emulator.scenes.loads.traction import Traction
 from emulator.scenes.part import Load
@@ -25,6 +26,7 @@ LOADS: dict[str, type[Load]] = {
         Traction,
         Force,
         CavityPressure,
+        ValvePressure,
         FollowerPressure,
         DeadPressure,
         PublishedPressure,
@@ -46,4 +48,5 @@ __all__ = [
     "PublishedPressure",
     "SurfacePressure",
     "Traction",
+    "ValvePressure",
 ]

@@ -108,7 +108,7 @@ class ActiveTension(Load):
         return stress * self._contracts(mesh)[:, None, None, None]
 
     @override
-    def term(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalTerm:
+    def terms(self, grid: Discretisation, fibres: Fibres | None = None) -> tuple[LocalTerm, ...]:
         """Return springs between nodes, or element energies where theta turns the fibres."""
         connectivity, (gradients, weights, along) = self._muscle(grid, fibres)
 
@@ -132,15 +132,16 @@ class ActiveTension(Load):
             return 0.5 * self.value(values) * work.sum()
 
         if along.angles:
-            return LocalTerm(connectivity, (gradients, weights, along), of_element, convex=True)
+            return (LocalTerm(connectivity, (gradients, weights, along), of_element, convex=True),)
         pairs, stiffness = self._springs(connectivity, gradients, weights, along.directions)
         X = grid.mesh.nodes
-        return LocalTerm(
-            pairs, (stiffness, X[pairs[:, 1]] - X[pairs[:, 0]]), of_spring, convex=True
-        )
+        springs = (stiffness, X[pairs[:, 1]] - X[pairs[:, 0]])
+        return (LocalTerm(pairs, springs, of_spring, convex=True),)
 
     @override
-    def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
+    def on_loaded(
+        self, grid: Discretisation, fibres: Fibres | None = None
+    ) -> tuple[LocalForce, ...]:
         """Return the force of the stress on the nodes of each element."""
 
         def at_point(
@@ -159,7 +160,7 @@ class ActiveTension(Load):
             forces = jax.vmap(at_point, (None, 0, 0, 0))(w, gradients, weights, along.at(values))
             return self.value(values) * forces.sum(0)
 
-        return LocalForce(*self._muscle(grid, fibres), force)
+        return (LocalForce(*self._muscle(grid, fibres), force),)
 
     def _contracts(self, mesh: Mesh) -> np.ndarray:
         """Return whether each element contracts, (m,) bool."""

@@ -58,7 +58,9 @@ class Force(Load):
         return {self.amount: self._spread(grid.mesh)}
 
     @override
-    def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
+    def on_loaded(
+        self, grid: Discretisation, fibres: Fibres | None = None
+    ) -> tuple[LocalForce, ...]:
         mesh, amount = grid.mesh, self.amount
         nodes = mesh.node_set(self.node_set)
         if len(edges_between(mesh, nodes)):
@@ -71,7 +73,7 @@ class Force(Load):
         def force(_: jax.Array, share: jax.Array, values: Values) -> jax.Array:
             return share if amount is None else values[amount] * share
 
-        return LocalForce(nodes[:, None], share, force)
+        return (LocalForce(nodes[:, None], share, force),)
 
     def _spread(self, mesh: Mesh) -> np.ndarray:
         return shares(mesh, mesh.node_set(self.node_set))[:, None] * (

@@ -57,7 +57,9 @@ class Weight(Load):
         return {name: volumes[:, None] * force for name, force in self.body_forces.items()}
 
     @override
-    def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
+    def on_loaded(
+        self, grid: Discretisation, fibres: Fibres | None = None
+    ) -> tuple[LocalForce, ...]:
         body_forces = self.body_forces
 
         def force(w: jax.Array, data: tuple[jax.Array, jax.Array], values: Values) -> jax.Array:
@@ -67,7 +69,7 @@ class Weight(Load):
             scaled = (b if name is None else values[name] * b for name, b in body_forces.items())
             return volumes[:, None] * sum(scaled)
 
-        return LocalForce(grid.connectivity, (grid.gradients, grid.weights), force)
+        return (LocalForce(grid.connectivity, (grid.gradients, grid.weights), force),)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,10 @@ With the normals of the facets pointing out of the tissue and :math:`x = X + u`:
   The lid is fixed and drops out. A rim may also slide in a plane of symmetry through the origin:
   the cone over the opening, from the origin, then has no volume.
 
+* :class:`ValvePressure`: on the wall of a cavity and on lids over all its openings, such as closed
+  valves. The work is that on the volume, with lids that move with their rims,
+  :math:`\Pi_p = -p\,[V(u) - V(0)]`, so the rims are free to move.
+
 * :class:`FollowerPressure`: on an open patch, by its virtual work,
 
   .. math::
@@ -33,7 +37,7 @@ With the normals of the facets pointing out of the tissue and :math:`x = X + u`:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, override
 
@@ -43,7 +47,7 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import Discretisation, FacetRule, facet_rule
-from emulator.geometry.facets import cone_volume, nodal_area_vectors, rim
+from emulator.geometry.facets import Cavity, cone_volume, lids, nodal_area_vectors, rim
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.kinematics import cofactor
 from emulator.mechanics.laws.law import Quantity
@@ -105,9 +109,11 @@ class DeadPressure(SurfacePressure):
         return {self.parameter: per_kpa} if known is None else {None: known * per_kpa}
 
     @override
-    def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
+    def on_loaded(
+        self, grid: Discretisation, fibres: Fibres | None = None
+    ) -> tuple[LocalForce, ...]:
         # The surface at rest is x + w: as a pressure that follows w.
-        return FollowerPressure(**vars(self)).force(grid)
+        return (FollowerPressure(**vars(self)).force(grid),)
 
 
 class FollowingPressure(SurfacePressure):
@@ -136,13 +142,15 @@ class FollowerPressure(FollowingPressure):
         return LocalForce(facets, corners, force)
 
     @override
-    def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
+    def on_loaded(
+        self, grid: Discretisation, fibres: Fibres | None = None
+    ) -> tuple[LocalForce, ...]:
         following = self.force(grid)
 
         def force(w: jax.Array, corners: jax.Array, values: Values) -> jax.Array:
             return following.force(jnp.zeros_like(w), corners, values)
 
-        return replace(following, force=force)
+        return (replace(following, force=force),)
 
 
 @dataclass(frozen=True)
@@ -173,17 +181,70 @@ class CavityPressure(FollowingPressure):
             )
 
     @override
-    def term(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalTerm:
+    def terms(self, grid: Discretisation, fibres: Fibres | None = None) -> tuple[LocalTerm, ...]:
         facets = grid.mesh.facet_set(self.facet_set)
 
         def energy(u: jax.Array, corners: jax.Array, values: Values) -> jax.Array:
             return -self.value(values) * (cone_volume(corners) - cone_volume(corners + u))
 
-        return LocalTerm(facets, grid.mesh.nodes[facets], energy)
+        return (LocalTerm(facets, grid.mesh.nodes[facets], energy),)
 
     @override
-    def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
+    def on_loaded(
+        self, grid: Discretisation, fibres: Fibres | None = None
+    ) -> tuple[LocalForce, ...]:
         return self.at_held_nodes.on_loaded(grid)
+
+
+@dataclass(frozen=True)
+class ValvePressure(FollowingPressure):
+    """Pressure in a cavity whose openings are closed by valves that carry it, too.
+
+    A valve is a flat lid, a fan from the middle of its rim, and pulls on the rim.
+    """
+
+    kind: ClassVar[str] = "valve_pressure"
+
+    @override
+    def check(self, mesh: Mesh, prescribed: Prescribed) -> None:
+        """Refuse a surface that encloses nothing, or whose openings no lid can close."""
+        Cavity(mesh, self.facet_set)
+
+    @override
+    def terms(self, grid: Discretisation, fibres: Fibres | None = None) -> tuple[LocalTerm, ...]:
+        return (*CavityPressure(**vars(self)).terms(grid), *self._of_lids(grid))
+
+    @override
+    def on_loaded(
+        self, grid: Discretisation, fibres: Fibres | None = None
+    ) -> tuple[LocalForce, ...]:
+        return (
+            *FollowerPressure(**vars(self)).on_loaded(grid),
+            *(_as_loaded(term) for term in self._of_lids(grid)),
+        )
+
+    def _of_lids(self, grid: Discretisation) -> list[LocalTerm]:
+        """Return the potential of the pressure on each lid, one group of all nodes of its rim."""
+        mesh = grid.mesh
+        terms = []
+        for rim_nodes, cone in lids(mesh.facet_set(self.facet_set)):
+
+            def energy(
+                u: jax.Array, at_rest: jax.Array, values: Values, cone: Callable = cone
+            ) -> jax.Array:
+                return -self.value(values) * (cone(at_rest) - cone(at_rest + u))
+
+            terms.append(LocalTerm(rim_nodes[None], mesh.nodes[rim_nodes][None], energy))
+        return terms
+
+
+def _as_loaded(term: LocalTerm) -> LocalForce:
+    """Return the force of a potential on the shape on which its group's nodes are at rest."""
+
+    def force(w: jax.Array, data: Any, values: Values) -> jax.Array:
+        return -jax.grad(term.energy)(jnp.zeros_like(w), data, values)
+
+    return LocalForce(term.nodes, term.data, force)
 
 
 @dataclass(frozen=True)
@@ -202,7 +263,7 @@ class PublishedPressure(SurfacePressure):
             )
 
     @override
-    def term(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalTerm:
+    def terms(self, grid: Discretisation, fibres: Fibres | None = None) -> tuple[LocalTerm, ...]:
         mesh = grid.mesh
         facets = mesh.facet_set(self.facet_set)
         behind = mesh.elements_behind(facets)
@@ -217,4 +278,4 @@ class PublishedPressure(SurfacePressure):
             F = jnp.eye(3, dtype=u.dtype) + u.T @ gradients
             return self.value(values) * jnp.vdot(mean @ u, cofactor(F) @ area)
 
-        return LocalTerm(nodes, data, energy)
+        return (LocalTerm(nodes, data, energy),)

@@ -47,11 +47,13 @@ class Traction(Load):
         return {None: area[:, None] * np.asarray(self.traction, dtype=float)}
 
     @override
-    def on_loaded(self, grid: Discretisation, fibres: Fibres | None = None) -> LocalForce:
+    def on_loaded(
+        self, grid: Discretisation, fibres: Fibres | None = None
+    ) -> tuple[LocalForce, ...]:
         mesh = grid.mesh
         facets, rule = mesh.facet_set(self.facet_set), facet_rule(mesh.order, 4)
 
         def force(w: jax.Array, corners: jax.Array, _: Values) -> jax.Array:
             return nodal_areas(corners + w, rule)[:, None] * np.asarray(self.traction, dtype=float)
 
-        return LocalForce(facets, mesh.nodes[facets], force)
+        return (LocalForce(facets, mesh.nodes[facets], force),)

@@ -70,13 +70,14 @@ class ElasticSupport(BoundaryCondition):
         return every if self.stiffness is None else every[:-1]
 
     @override
-    def term(self, grid: Discretisation) -> LocalTerm:
+    def terms(self, grid: Discretisation) -> tuple[LocalTerm, ...]:
         """Return the energy of the springs, facet by facet."""
         facets, corners, rule = self._facets(grid.mesh)
-        return LocalTerm(facets, area_vectors(corners, rule), partial(self._energy, rule))
+        term = LocalTerm(facets, area_vectors(corners, rule), partial(self._energy, rule))
+        return (term,)
 
     @override
-    def on_loaded(self, grid: Discretisation) -> LocalForce:
+    def on_loaded(self, grid: Discretisation) -> tuple[LocalForce, ...]:
         """Return the force of springs at rest with the body, on the surface at rest, ``x + w``."""
         facets, corners, rule = self._facets(grid.mesh)
 
@@ -84,7 +85,7 @@ class ElasticSupport(BoundaryCondition):
             normals = area_vectors(corners + w, rule)
             return -jax.grad(partial(self._energy, rule))(-w, normals, values)
 
-        return LocalForce(facets, corners, force)
+        return (LocalForce(facets, corners, force),)
 
     def _facets(self, mesh: Mesh) -> tuple[np.ndarray, np.ndarray, FacetRule]:
         """Return facets (k, a), their nodes (k, a, 3), and a rule for the degree of ``|u|^2``."""

@@ -59,7 +59,7 @@ def test_volume_of_a_closed_surface():
 
 def test_pressure_on_a_closed_surface_has_no_net_force_or_moment():
     scene = closed()
-    term = CavityPressure("surface", 2.0).term(scene.discretisation)
+    (term,) = CavityPressure("surface", 2.0).terms(scene.discretisation)
     u = jnp.asarray(0.1 * np.random.default_rng(1).normal(size=scene.held.shape))
     force = -jax.grad(lambda v: term.total(v, {}))(u)
     np.testing.assert_allclose(force.sum(axis=0), 0.0, atol=1e-12)
@@ -71,7 +71,7 @@ def test_pressure_on_a_closed_surface_has_no_net_force_or_moment():
 
 def test_the_energy_is_minus_p_times_the_change_in_volume():
     scene = membrane(CavityPressure("right", 0.7))
-    term, V = scene.loads[0].term(scene.discretisation), volume_behind(scene, "right")
+    (term,), V = scene.loads[0].terms(scene.discretisation), volume_behind(scene, "right")
     u = jnp.where(scene.held, 0.0, 0.1)
     change = 1000.0 * (V(u) - V(jnp.zeros_like(u)))
     assert term.total(u, {}) == pytest.approx(-0.7 * float(change), rel=1e-12)

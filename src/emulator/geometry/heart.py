@@ -1,0 +1,359 @@
+r"""Both ventricles, meshed between three surfaces: left and right endocardium, and the epicardium.
+
+The septum is what lies between the endocardia. Each opening of an endocardium is a valve, or the
+base of a ventricle, and belongs to the nearest opening of the epicardium. There the wall ends in a
+ring of triangles between both rims, or, where an opening of the epicardium is around several, in
+one patch between all of them.
+
+Surfaces that were fitted to images meet at the valves, and the wall ends in an edge. A ring of the
+epicardium, 4 mm wide or less, is cut off there and replaced by one row of triangles. So that the
+edge is not too sharp, and no wall too thin, a point y of the epicardium that is less than h from
+the nearest point x of an endocardium, of normal n, is moved away from it,
+
+.. math:: y \leftarrow x + h\, m, \qquad m \propto (y - x) + (h - |y - x|)\, n, \qquad
+          h = \min(h_0, \tfrac12 r) ,
+
+with the distance r to the rim. Both cavities stay as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from itertools import combinations, pairwise
+from pathlib import Path
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
+
+from emulator.core.errors import InputError, look_up
+from emulator.geometry.discretisation import discretise, mesh_quality
+from emulator.geometry.facets import MM3_PER_ML, Cavity
+from emulator.geometry.fibres import BOTH
+from emulator.geometry.mesh import SIDES, Mesh
+from emulator.geometry.refinement import to_linear, unfolded
+from emulator.geometry.remeshing import DiscMap, Unmeshable, rim_loops, triangulate
+from emulator.geometry.surfaces import (
+    UNITS,
+    Surface,
+    area_vector,
+    axes_across,
+    clipped,
+    closed,
+    inside,
+    place_of,
+    sampled,
+    smoothed,
+)
+from emulator.geometry.wall import (
+    Wall,
+    distances,
+    farthest,
+    fill,
+    mesh_that_fits,
+    surface_in_mm,
+    thickness_of,
+)
+
+LEFT, RIGHT, EPICARDIUM = BOTH
+VALVES: Mapping[str, tuple[str, ...]] = {
+    LEFT: ("mitral", "aortic"),
+    RIGHT: ("tricuspid", "pulmonary"),
+}
+"""The valves of each ventricle, the longer rim first."""
+_SQUARES = 1200  # of the edges' length that have the area of all surfaces: some 10 000 nodes
+_RING = 4.0  # mm, width of the ring at a valve where surfaces meet
+_LEAST = 2.0  # mm, thickness below which the epicardium is moved
+_SLOPE = 0.5  # of the distance to a rim, likewise: the wall ends in no sharper edge than 30 degrees
+_BETWEEN = 0.4  # of the way between two valves' rims: nothing is cut off further away
+_FINE = 0.25  # of it, between the endocardium's points that it is moved away from
+_NARROW = 1.5  # of the edges: what joins rims further apart gets nodes of its own
+_ASTRAY = 1.0  # of a rim's radius: further away, an opening of the epicardium is another one
+_SAME = 0.01  # of the extent: surfaces nearer to each other, in the median, are one
+
+
+def mesh_heart(
+    endocardium: str | Path | Surface,
+    right: str | Path | Surface,
+    epicardium: str | Path | Surface,
+    *,
+    size: float | None = None,
+    order: int = 2,
+    smooth: int = 0,
+    least: float = _LEAST,
+    unit: str = "mm",
+) -> Wall:
+    """Mesh the walls of both ventricles with tetrahedra, open at the valves or at the base.
+
+    The mesh has facet sets lv_endocardium, rv_endocardium and epicardium; base, where the wall
+    ends; and mitral, aortic, tricuspid and pulmonary, the parts of it around each valve.
+
+    Parameters
+    ----------
+    endocardium, right, epicardium : files of triangles (STL, PLY, OBJ), or surfaces in mm: the left
+        and the right ventricle's inside, and the outside of both.
+    size : the edge length in mm; by default one with which a human heart has some 10 000 quadratic
+        nodes, or less where a wall is too thin for it.
+    order : 2 for quadratic elements with curved edges on the surfaces, or 1.
+    smooth : times of Taubin's filter on all surfaces.
+    least : the least thickness of a wall, mm; the epicardium is moved to where it has it.
+    unit : the unit of the files, ``mm``, ``cm`` or ``m``.
+
+    Raises
+    ------
+    InputError
+        A surface that :func:`~emulator.geometry.surfaces.surface` refuses, or that is closed;
+        openings that do not belong together; surfaces that are swapped, apart, or cross; lengths
+        that are not in mm; no Gmsh; or a wall too thin for ``size`` mm, or for any.
+    """
+    if order not in (1, 2):
+        raise InputError(f"order {order}: expected 1 or 2")
+    look_up(UNITS, unit, "unit")
+    if smooth < 0 or not least > 0.0:
+        raise InputError(f"smooth {smooth}, least {least} mm: expected 0 times or more, above 0 mm")
+    given = [
+        surface_in_mm(source, name, unit)
+        for source, name in ((endocardium, LEFT), (right, RIGHT), (epicardium, EPICARDIUM))
+    ]
+    _joints(given)
+    inner, outer = [smoothed(each, smooth) for each in given[:2]], smoothed(given[2], smooth)
+    _check_places([*inner, outer])
+    moved = [*inner, _away(outer, inner, least)]
+    surfaces = [*inner, _without_edge(moved[2], inner)]
+    rims = [given[0].points[loop] for loop in rim_loops(given[0])]
+    axis = np.sum([area_vector(rim) for rim in rims], axis=0)
+    axis /= np.linalg.norm(axis)
+    axis *= np.sign((np.concatenate(rims).mean(axis=0) - given[0].points.mean(axis=0)) @ axis)
+    ways = distances(surfaces[0].points, surfaces[1:])
+    make = partial(_mesh, [DiscMap(each) for each in surfaces], _joints(surfaces), axis, order)
+    thickness = thickness_of(ways)
+    area = sum(each.area for each in surfaces)
+    length, before = mesh_that_fits(
+        make, thickness, size, np.sqrt(area / _SQUARES), given[2].extent
+    )
+    mesh, folded = unfolded(before) if order == 2 else (before, 0)
+    volumes = [each.volume / MM3_PER_ML for each in given]
+    wall = float(discretise(mesh).weights.sum()) / MM3_PER_ML
+    return Wall(
+        mesh=mesh,
+        axis=axis,
+        base=np.concatenate(rims).mean(axis=0),
+        size=length,
+        thickness=thickness,
+        cavities={
+            name: (Cavity(mesh, name).rest, own)
+            for name, own in zip((LEFT, RIGHT), volumes, strict=False)
+        },
+        wall=(wall, volumes[2] - volumes[1] - volumes[0]),
+        cut_off=(0.0, 0.0),
+        moved=farthest(*(s.points for pair in zip(given, moved, strict=True) for s in pair)),
+        folded=(folded, farthest(mesh.nodes, before.nodes)),
+        warnings=(),
+        quality=mesh_quality(mesh),
+    )
+
+
+Joint = list[tuple[int, int]]
+"""Openings that the wall ends between: surface and rim of each, the epicardium's first."""
+
+
+def _joints(surfaces: Sequence[Surface]) -> dict[str, Joint]:
+    """Return the openings that belong together, by the name of what is between them."""
+    loops = [rim_loops(each) for each in surfaces]
+    for each, own in zip(surfaces, loops, strict=True):
+        if not own:
+            raise InputError(f"{each.name}: it is closed; expected it open at valves or base")
+    outer = [surfaces[2].points[loop] for loop in loops[2]]
+    trees = [cKDTree(rim, balanced_tree=False) for rim in outer]
+    joints: dict[int, Joint] = {}
+    names: dict[int, str] = {}
+    for k, (each, own) in enumerate(zip(surfaces[:2], loops[:2], strict=True)):
+        if len(own) > len(VALVES[each.name]):
+            raise InputError(
+                f"{each.name}: it has {len(own)} openings, the smallest of {len(own[-1])} edges at "
+                f"{place_of(each.points[own[-1]].mean(axis=0))}; expected two valves at most: fill "
+                "the others"
+            )
+        for number, loop in enumerate(own):
+            rim = each.points[loop]
+            ways = [tree.query(rim)[0].mean() for tree in trees]
+            nearest = int(np.argmin(ways))
+            radius = np.sqrt(np.linalg.norm(area_vector(rim)) / np.pi)
+            if ways[nearest] > _ASTRAY * radius:
+                raise InputError(
+                    f"{each.name}: no opening of the epicardium is at its opening around "
+                    f"{place_of(rim.mean(axis=0))}; the nearest is {ways[nearest]:.3g} mm away"
+                )
+            joints.setdefault(nearest, [(2, nearest)]).append((k, number))
+            names[nearest] = VALVES[each.name][number] if len(own) > 1 else f"{each.name}_base"
+    for number, rim in enumerate(outer):
+        if number not in joints:
+            raise InputError(
+                f"{surfaces[2].name}: neither endocardium has an opening at that around "
+                f"{place_of(rim.mean(axis=0))}, of {len(rim)} edges; fill it"
+            )
+    return {names[n] if len(own) == 2 else "base": own for n, own in joints.items()}
+
+
+def _check_places(surfaces: Sequence[Surface]) -> None:
+    """Raise :class:`InputError` unless two endocardia lie beside each other in the epicardium."""
+    left, right, outer = surfaces
+    for one, other in ((left, right), (left, outer), (right, outer)):
+        if np.median(distances(one.points, [other])) < _SAME * outer.extent:
+            raise InputError(f"{one.name} and {other.name} are one surface; give three")
+    up = np.eye(3)[2]
+    whole = {each.name: closed(each) for each in surfaces}
+    for each in (left, right):
+        if inside(whole[each.name], outer.points, up).mean() > 0.5:
+            raise InputError(
+                f"{each.name} and {outer.name} are swapped: the epicardium lies within it"
+            )
+        out = ~inside(whole[outer.name], each.points, up)
+        rims = cKDTree(outer.points[np.concatenate(rim_loops(outer))], balanced_tree=False)
+        out &= rims.query(each.points)[0] > _LEAST  # where surfaces meet, round-off decides
+        if out.all():
+            raise InputError(
+                f"{each.name} lies outside of the epicardium: its middle is at "
+                f"{place_of(each.points.mean(axis=0))}"
+            )
+        if out.any():
+            raise InputError(
+                f"{each.name} crosses the epicardium: {int(out.sum())} of its points are outside, "
+                f"around {place_of(each.points[out].mean(axis=0))}; repair them there"
+            )
+    for each, other in ((left, right), (right, left)):
+        within = inside(whole[other.name], each.points, up)
+        if within.any():
+            raise InputError(
+                f"{each.name} crosses {other.name}: {int(within.sum())} of its points are inside, "
+                f"around {place_of(each.points[within].mean(axis=0))}; repair them there"
+            )
+
+
+def _away(outer: Surface, inner: Sequence[Surface], least: float) -> Surface:
+    """Return the epicardium with its points at least so many mm from both endocardia."""
+    places, normals = (
+        np.vstack([sampled(each, values(each), _FINE * least) for each in inner])
+        for values in (lambda each: each.points, lambda each: each.normals)
+    )
+    rims = np.vstack([each.points[loop] for each in inner for loop in rim_loops(each)])
+    to_rim = cKDTree(rims, balanced_tree=False).query(outer.points)[0]
+    h = np.minimum(least, _SLOPE * to_rim)
+    distance, nearest = cKDTree(places, balanced_tree=False).query(outer.points)
+    near = distance < h
+    x, d, h = places[nearest[near]], distance[near, None], h[near, None]
+    away = outer.points[near] - x + (h - d) * normals[nearest[near]]
+    points = outer.points.copy()
+    points[near] = x + h * away / np.linalg.norm(away, axis=1, keepdims=True)
+    return Surface(outer.name, points, outer.triangles)
+
+
+def _without_edge(outer: Surface, inner: Sequence[Surface]) -> Surface:
+    """Return the epicardium less a ring at each rim that meets an endocardium's.
+
+    Less where rims are so near to each other that what is left between them would be narrow.
+    """
+    rims = np.vstack([each.points[loop] for each in inner for loop in rim_loops(each)])
+    own = rim_loops(outer)
+    trees = [cKDTree(outer.points[loop], balanced_tree=False) for loop in own]
+    pairs = combinations(range(len(own)), 2)
+    between = [trees[k].query(outer.points[own[other]])[0].min() for k, other in pairs]
+    to_rim = cKDTree(rims, balanced_tree=False).query(outer.points)[0]
+    meeting = [loop for loop in own if to_rim[loop].mean() < _LEAST]
+    if not meeting:
+        return outer
+    edges = np.unique(np.sort(outer.triangles[:, SIDES].reshape(-1, 2), axis=1), axis=0)
+    lengths = np.linalg.norm(outer.points[edges[:, 0]] - outer.points[edges[:, 1]], axis=1)
+    graph = coo_array((lengths, edges.T), shape=(len(outer.points),) * 2).tocsr()
+    ways = dijkstra(graph, directed=False, indices=np.concatenate(meeting), min_only=True)
+    return clipped(outer, min(_RING, _BETWEEN * min(between, default=np.inf)) - ways)
+
+
+def _mesh(
+    maps: Sequence[DiscMap], joints: Mapping[str, Joint], axis: np.ndarray, order: int, size: float
+) -> Mesh:
+    """Return the walls between three surfaces, the epicardium last."""
+    new = [each.remeshed(size) for each in maps]
+    outer, up = closed(new[2].surface), np.eye(3)[2]
+    for each, other in ((new[0], new[1]), (new[1], new[0])):
+        points = each.surface.points
+        rims = cKDTree(points[np.concatenate(each.loops)], balanced_tree=False)
+        points = points[rims.query(points)[0] > size]  # a lid may be below a rim's points
+        bad = ~inside(outer, points, up) | inside(closed(other.surface), points, up)
+        if bad.any():
+            raise Unmeshable(
+                f"the wall is too thin for edges of {size:.3g} mm at {place_of(points[bad][0])}"
+            )
+    points = np.vstack([each.surface.points for each in new])
+    first = np.cumsum([0, *(len(each.surface.points) for each in new)])
+    facets, more = dict[str, np.ndarray](), np.zeros((0, 3))
+    for name, openings in joints.items():
+        loops = [first[k] + new[k].loops[number] for k, number in openings]
+        if len(loops) == 2 and _way(*(points[loop] for loop in loops)) < _NARROW * size:
+            facets[name] = zipped(points, *loops)
+            continue
+        facets[name], added = _patch(points, loops, size, len(points) + len(more))
+        more = np.vstack([more, added])
+    mesh = fill(maps, new, facets, more, axis, size, order)
+    shape = mesh_quality(mesh if order == 1 else to_linear(mesh))
+    if shape.flat:
+        raise Unmeshable(
+            f"{shape.flat} elements of edges of {size:.3g} mm would be flat, one of them at "
+            f"{place_of(np.array(shape.place))}"
+        )
+    if "base" in facets:
+        return mesh
+    base = np.concatenate([mesh.facet_set(name) for name in facets])
+    sets = {**mesh.node_sets, "base": np.unique(base)}
+    return Mesh(mesh.nodes, mesh.elements, sets, {**mesh.facet_sets, "base": base})
+
+
+def _way(one: np.ndarray, other: np.ndarray) -> float:
+    """Return the largest distance in mm of points (k, 3) to the others (l, 3)."""
+    return float(cKDTree(other, balanced_tree=False).query(one)[0].max())
+
+
+def zipped(points: np.ndarray, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return triangles (t, 3) between two closed loops (k,) and (l,) of ``points`` (n, 3)."""
+    start = int(cKDTree(points[other], balanced_tree=False).query(points[one[0]])[1])
+    other = np.roll(other, -start)
+    if area_vector(points[one]) @ area_vector(points[other]) < 0.0:
+        other = np.concatenate([other[:1], other[:0:-1]])
+    loops = [np.append(loop, loop[0]) for loop in (one, other)]
+    shares = []
+    for loop in loops:
+        steps = np.linalg.norm(np.diff(points[loop], axis=0), axis=1)
+        shares.append(np.concatenate([[0.0], np.cumsum(steps)]) / steps.sum())
+    ends = np.concatenate(
+        [np.stack([s[1:], np.full(len(s) - 1, k)], 1) for k, s in enumerate(shares)]
+    )
+    at, rows = [0, 0], []
+    for _, side in ends[np.lexsort(ends.T[::-1])]:
+        k = int(side)
+        rows.append((loops[0][at[0]], loops[1][at[1]], loops[k][at[k] + 1]))
+        at[k] += 1
+    return np.array(rows)
+
+
+def _patch(
+    points: np.ndarray, loops: Sequence[np.ndarray], size: float, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return triangles (t, 3) between loops, the outer one first, and the points (k, 3) they add.
+
+    As high above the outer loop's plane as the loops' points around them. ``count`` is the number
+    of the first point that is added.
+    """
+    middle, normal = points[loops[0]].mean(axis=0), area_vector(points[loops[0]])
+    frame = axes_across(normal / np.linalg.norm(normal))
+    frame = np.vstack([frame, np.cross(*frame)])
+    on_loops = np.concatenate(loops)
+    at = (points[on_loops] - middle) @ frame.T
+    ends = np.cumsum([0, *map(len, loops)])
+    flat, rows = triangulate([at[a:b, :2] for a, b in pairwise(ends)], size)
+    inner = flat[len(at) :]
+    ways = np.linalg.norm(inner[:, None] - at[None, :, :2], axis=-1) ** -2.0
+    height = (ways @ at[:, 2]) / ways.sum(axis=1)
+    number = np.concatenate([on_loops, np.arange(count, count + len(inner))])
+    return number[rows], middle + np.column_stack([inner, height]) @ frame
