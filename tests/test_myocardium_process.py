@@ -6,6 +6,10 @@ import numpy as np
 import pytest
 from studies.sheep_myocardium import cube, process
 
+import calibrate as cal
+import emulator as em
+from emulator.scenes.states import states
+
 pytestmark = pytest.mark.slow
 
 
@@ -31,6 +35,39 @@ def test_formula_of_an_isotropic_cube():
     stretch, I1 = 1.1, 1.1**2 + 2.0 / 1.1
     sigma = 1.2 * np.exp(6.0 * (I1 - 3.0)) * (stretch**2 - 1.0 / stretch)
     assert float(stretched) == pytest.approx(1e-3 * 90.0 * sigma / stretch, rel=5e-3)
+
+
+def test_the_formula_is_that_of_specimens():
+    """Each of the five directions of fibres is a specimen's, in the same states."""
+    amounts, number = np.array([[-0.3, 0.2], [0.1, 0.4], [-0.1, 0.12]]), 1
+    x = position(a=1.2, b=6.0, a_f=2.0, b_f=5.0, a_s=1.0, b_s=4.0, a_fs=0.5, b_fs=3.0)
+    x = x.at[8:].set(jnp.array([0.3, -0.2]))
+    angles = np.zeros((5, len(x)))
+    angles[:, 8:] = cube.SPREAD / 45.0 * cube._NODES
+    fibres, sheets = np.moveaxis([cube.turned_to(number, x + each) for each in angles], 1, 0)
+    stretch = np.concatenate([np.ones(4), 1.0 + amounts[2]])
+    shears = np.zeros((2, 6))
+    shears[0, :2], shears[1, 2:4] = amounts[:2]
+    given = dict(zip(("shear_yx", "shear_zx"), shears, strict=True))
+    given |= {"stretch_x": stretch, "stretch_y": stretch**-0.5}
+    scene = em.specimen(
+        states({name: np.tile(each, 5) for name, each in given.items()}, ordered=False),
+        law=em.find_law("holzapfel_ogden_orthotropic"),
+        parameters=cube.MATERIAL,
+        constants={"kappa": cube.KAPPA},
+        fibres=np.repeat(fibres, 6, axis=0),
+        sheets=np.repeat(sheets, 6, axis=0),
+    )
+    forward = em.homogeneous(scene, incompressible=True)
+    observe = cal.stresses(scene, "stress_yx,stress_zx,cauchy_x,cauchy_y,cauchy_z")
+    theta = cube.theta_of(x)[:8]
+    stress = np.asarray(observe(forward(theta), theta)).reshape(5, 6, 5)
+    pulled = stress[:, 4:, 2] - 0.5 * (stress[:, 4:, 3] + stress[:, 4:, 4])
+    along = [stress[:, :2, 0], stress[:, 2:4, 1], pulled / stretch[4:]]
+    H, C = (jnp.asarray(np.stack([each] * 3)) for each in cube.homogeneous(amounts))
+    found = cube.formula(jnp.tile(x, (3, 1)), H, C, jnp.full(3, 90.0))[number]
+    expected = 0.09 * cube._WEIGHTS @ np.concatenate(along, axis=1)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
 def test_the_formulas_fibres_miss_their_angles():

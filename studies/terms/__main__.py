@@ -73,7 +73,7 @@ def examine(model: cal.Model, number: int, error: float) -> Case:
     moduli[chosen] = 5.0 * shares / np.where(sizes > 0.0, sizes, np.inf)[chosen]
     clean = np.asarray(exact(moduli))
     noise = error * np.sqrt(np.mean(clean**2)) * rng.normal(size=clean.shape)
-    found = find_terms(model, clean + noise)
+    found = find_terms(model, clean + noise, held_out=False)
     seen = [TERMS[k] for k in chosen if moduli[k] > 0.0]
     return {
         "true": seen,

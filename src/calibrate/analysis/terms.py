@@ -1,56 +1,72 @@
 r"""Which terms of a law a test shows: all sets of terms, compared by their evidence.
 
-Data that are linear in moduli c, each of which is zero or positive,
-
-.. math::
-    y = G c + \varepsilon, \quad \varepsilon \sim N(0, \sigma^2 I_n), \qquad
-    c_k = 0 \text{ with probability } 1 - \pi, \text{ else } c_k > 0 .
-
-Correlated errors are whitened first. With the least-squares moduli :math:`\hat c` of a set S of
-terms and :math:`A = G_S^T G_S / \sigma^2`, the prior of its moduli has the information of one of
-the n data (Kass and Wasserman 1995), :math:`N(\hat c, n A^{-1})` where all are positive. It needs
-no scale of anybody's choice, and the evidence is in closed form up to the probabilities
-:math:`\Phi^+` that normal vectors are positive,
-
-.. math::
-    \frac{p(y \mid S, \sigma)}{N(y; 0, \sigma^2 I)} =
-        e^{\frac12 \hat c^T A \hat c}\; (1 + n)^{-|S| / 2}\;
-        \frac{\Phi^+(\hat c, A^{-1} n / (n + 1))}{\Phi^+(\hat c, A^{-1} n)} .
-
-All sets of up to five terms are compared, over a grid of :math:`\log\sigma`, so no chain has to
-find the way between sets that explain the data alike. The probability of a term is the sum over
-the sets that have it; where two terms do the same, each gets a part, and neither is near 0 or 1.
+The evidence is that of :mod:`calibrate.analysis.term_sets`. It says which set is likeliest, not
+that any is right. So each test is left out in turn, and predicted by all sets with the
+probabilities and moduli that the other tests give them (:class:`HeldOut`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from itertools import combinations
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from scipy.special import log_ndtr, logsumexp
-from scipy.stats import multivariate_normal
+from scipy.special import bdtr
 
+from calibrate.analysis.term_sets import PRESENT, posterior_of_sets, seen_columns
 from calibrate.noise import information_about_means
 from calibrate.statistical_model.model import Model
 from emulator.core.display import TableRepr
 from emulator.core.errors import InputError
 
-MOST_TERMS = 5
-"""Largest number of terms of a set."""
-_PRESENT = 0.25  # prior probability of a term
-_NOISES = 13  # sds of the noise, in equal ratios
-_UNLIKELY = 9.0  # log evidence below the best from which a set is left out
+_MINOR = 1e-3  # share of the likeliest set's probability below which a set predicts nothing
+_TAIL = 0.05  # outside either end of a band
+_MISSED = 0.7  # share of points inside the 90 % band below which a test is not predicted, and
+_CHANCE = 1e-3  # probability of no more points inside, were their errors independent
+_BETTER = 0.05  # log density of a point by which another set predicts better
 _LISTED = 5  # sets that are told
-_RIDGE = 1e-8  # of columns of length 1: two may be the same
-_FAR = 8.0  # sds from zero at which a modulus is positive
-_HOPELESS = -12.0  # log probability below which the integral is not asked
 _LINEAR = 1e-6  # share of the data by which a linear map may miss the forward map
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """How well the other tests predict one test; a point is one number of its data.
+
+    test : its name.
+    points : the number of its points.
+    error : the root mean square error of the mean prediction, as a share of that of zero. Points
+        are weighted by their noise's sd.
+    in_noise : the same error, in sds of the noise as the other tests have it.
+    inside : the share of points inside the 90 % predictive band, noise included.
+    of_sets : the log predictive density of a point, on average, by each set of ``Terms.sets``.
+    alone : terms that no other test shows, without which it is predicted.
+    """
+
+    test: str
+    points: int
+    error: float
+    in_noise: float
+    inside: float
+    of_sets: Sequence[float]
+    alone: tuple[str, ...]
+
+    head: ClassVar = ("left out", "points", "error", "error / noise sd", "inside 90 % band")
+
+    @property
+    def missed(self) -> bool:
+        """Whether the other tests do not predict it: too few points are inside the band."""
+        chance = bdtr(round(self.inside * self.points), self.points, 1.0 - 2.0 * _TAIL)
+        return self.inside < _MISSED and bool(chance < _CHANCE)
+
+    @property
+    def cells(self) -> tuple[str, ...]:
+        """The test as a row of a table under ``head``."""
+        error, inside = f"{100.0 * self.error:.2g} %", f"{100.0 * self.inside:.0f} %"
+        return self.test, str(self.points), error, f"{self.in_noise:.2f}", inside
 
 
 @dataclass(frozen=True, repr=False)
@@ -61,17 +77,45 @@ class Terms(TableRepr):
     sets : the likeliest sets, and the probability of each.
     moduli : mean and sd of each modulus in kPa, where its term is present.
     noise : the posterior mean of the noise's size, as a factor of the model's.
+    held_out : of each test, how the others predict it; empty where there is one test.
     """
 
     probabilities: Mapping[str, float]
     sets: Sequence[tuple[tuple[str, ...], float]]
     moduli: Mapping[str, tuple[float, float]]
     noise: float
+    held_out: Sequence[HeldOut] = ()
 
     @property
     def undecided(self) -> tuple[str, ...]:
         """Terms of which the data cannot tell whether they are there."""
         return tuple(name for name, p in self.probabilities.items() if 0.05 < p < 0.95)
+
+    @property
+    def log_densities(self) -> Sequence[float]:
+        """The log predictive density of a held-out point, on average, by each of ``sets``.
+
+        Tests that alone show a term do not count; it is empty without others.
+        """
+        rows = [(each.points, each.of_sets) for each in self.held_out if not each.alone]
+        if not rows:
+            return []
+        points, by_test = zip(*rows, strict=True)
+        return [float(x) for x in np.average(by_test, axis=0, weights=points)]
+
+    def held_out_in_words(self) -> str:
+        """Return which tests the others do not predict, and which set predicts best."""
+        words = []
+        for each in self.held_out:
+            if each.missed:
+                alone = f", which alone shows {', '.join(each.alone)}" if each.alone else ""
+                words.append(f"the others do not predict '{each.test}'{alone}")
+        words = words or ["each test is predicted by the others"]
+        if scores := self.log_densities:
+            best = int(np.argmax(scores)) if max(scores) > scores[0] + _BETTER else 0
+            names = ", ".join(self.sets[best][0]) or "no term" if best else "no other set"
+            words.append(f"{names} predicts better than the likeliest set")
+        return "; ".join(words)
 
     def summary_rows(self) -> tuple[str, list[tuple[str, str]]]:
         """Return the title and a row for each term, the likeliest first."""
@@ -83,15 +127,21 @@ class Terms(TableRepr):
             rows.append((name, f"{probability:.3f}{size if probability > 0.05 else ''}"))
         if self.undecided:
             rows.append(("undecided", ", ".join(self.undecided)))
+        if self.held_out:
+            rows.append(("held out", self.held_out_in_words()))
         return "Probability of each term", rows
 
 
-def find_terms(model: Model, data: Mapping[str, Any] | np.ndarray) -> Terms:
+def find_terms(
+    model: Model, data: Mapping[str, Any] | np.ndarray, *, held_out: bool = True
+) -> Terms:
     """Return which of the moduli of ``model``'s scene are not zero.
 
     Every unknown of the scene is such a modulus. The noise is the model's, its inferred sds in the
     ratio of their priors' scales, times a factor with a log-uniform prior between a thousandth and
     a third of the size of the data.
+
+    held_out : whether each test is predicted by the others, too.
 
     Raises
     ------
@@ -105,8 +155,20 @@ def find_terms(model: Model, data: Mapping[str, Any] | np.ndarray) -> Terms:
     if not y.size or not np.any(y):
         raise InputError("terms: all data are zero, or there are none")
     names = model.forward.scene.parameter_names
-    seen = np.linalg.norm(G, axis=0) > 1e-9 * np.linalg.norm(G)
-    return _compared(G[:, seen], y, [n for n, s in zip(names, seen, strict=True) if s], names)
+    found = _compared(G, y, names)
+    if not held_out:
+        return found
+    return replace(found, held_out=_held_out(_of_tests(model), white, G, y, found))
+
+
+def _of_tests(model: Model) -> dict[str, np.ndarray]:
+    """Return the entries (k,) of each test in the data as ``ravel_pytree`` orders them."""
+    entries, begin = dict[str, list[np.ndarray]](), 0
+    for _, part in sorted(model.observe.parts.items()):
+        for test, own in part.data_of_tests.items():
+            entries.setdefault(test, []).append(begin + own)
+        begin += int(np.prod(part.shape))
+    return {test: np.concatenate(each) for test, each in entries.items()}
 
 
 def _whitening(model: Model) -> np.ndarray:
@@ -151,111 +213,45 @@ def _design(model: Model) -> np.ndarray:
     return G
 
 
-def _compared(G: np.ndarray, y: np.ndarray, names: Sequence[str], every: Sequence[str]) -> Terms:
+def _compared(G: np.ndarray, y: np.ndarray, names: Sequence[str]) -> Terms:
     """Return the outcome for the columns ``names`` of G (n, p); terms not seen keep their prior."""
-    size, p = float(np.sqrt(np.mean(y**2))), G.shape[1]
-    units = np.linalg.norm(G, axis=0)
-    least_squares = _LeastSquares((G / units).T @ (G / units), (G / units).T @ y, len(y))
-    sets = [S for k in range(min(MOST_TERMS, p) + 1) for S in combinations(range(p), k)]
-    counts = np.array([len(S) for S in sets])
-    prior = counts * np.log(_PRESENT) + (p - counts) * np.log1p(-_PRESENT)
-    fits = np.array([least_squares.explained(S) for S in sets])
-
-    def log_evidence(sds: np.ndarray) -> np.ndarray:
-        """Return the log evidence (sets, sds), ``-inf`` where it is hopeless."""
-        logs = 0.5 * (fits[:, None] - np.sum(y**2)) / sds**2 - len(y) * np.log(sds)
-        logs += (prior - 0.5 * counts * np.log1p(len(y)))[:, None]
-        # The likeliest sets of moduli of any sign may need negative ones: the best is known last.
-        found, best = np.full_like(logs, -np.inf), -np.inf
-        most = logs + counts[:, None] * np.log(2.0)
-        for place in np.argsort(-most, axis=None):
-            i, j = np.unravel_index(place, logs.shape)
-            if most[i, j] < best - _UNLIKELY:
-                break
-            found[i, j] = logs[i, j] + least_squares.log_positive(sets[i], sds[j])
-            best = max(best, found[i, j])
-        return found
-
-    coarse = np.geomspace(1e-3 * size, size / 3.0, _NOISES)
-    near = coarse[np.argmax(log_evidence(coarse).max(axis=0))]
-    sds = np.geomspace(0.6 * near, near / 0.6, _NOISES)
-    logs = log_evidence(sds)
-    weights = np.exp(logs - logsumexp(logs))
-    of_sets = weights.sum(axis=1)
-    present = {
-        name: float(sum(w for S, w in zip(sets, of_sets, strict=True) if k in S))
-        for k, name in enumerate(names)
-    }
-    best = np.argsort(-of_sets)[:_LISTED]
-    means = _moments(least_squares, sets, sds, weights)
+    posterior = posterior_of_sets(G, y, names)
+    best = np.argsort(-posterior.of_sets)[:_LISTED]
     return Terms(
-        {name: present.get(name, _PRESENT) for name in every},
-        [(tuple(names[k] for k in sets[i]), float(of_sets[i])) for i in best],
-        {names[k]: (mean / units[k], sd / units[k]) for k, (mean, sd) in means.items()},
-        float(weights.sum(axis=0) @ sds),
+        dict.fromkeys(names, PRESENT) | posterior.of_terms,
+        [(posterior.terms(i), float(posterior.of_sets[i])) for i in best],
+        posterior.moments,
+        posterior.noise,
     )
 
 
-@dataclass(frozen=True)
-class _LeastSquares:
-    """The data's share in columns of length 1.
+def _held_out(
+    tests: Mapping[str, np.ndarray], white: np.ndarray, G: np.ndarray, y: np.ndarray, terms: Terms
+) -> list[HeldOut]:
+    """Return how the others predict each of ``tests`` whose data are not zero.
 
-    gram : G^T G, (p, p). projected : G^T y, (p,). count : the number n of data.
+    white : the matrix (n, n) that made the errors of y (n,) independent.
     """
-
-    gram: np.ndarray
-    projected: np.ndarray
-    count: int
-
-    def of(self, S: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Return least-squares moduli of any sign, and their covariance at a noise of sd 1."""
-        rows = list(S)
-        inverse = np.linalg.inv(self.gram[np.ix_(rows, rows)] + _RIDGE * np.eye(len(rows)))
-        return inverse @ self.projected[rows], inverse
-
-    def explained(self, S: Sequence[int]) -> float:
-        """Return the part of the data's square that the terms explain."""
-        return float(self.of(S)[0] @ self.projected[list(S)]) if S else 0.0
-
-    def log_positive(self, S: Sequence[int], sd: float) -> float:
-        """Return the log probability that all moduli are positive, over that of the prior."""
-        if not S:
-            return 0.0
-        mean, inverse = self.of(S)
-        n = float(self.count)
-        covariance = sd**2 * inverse
-        return _log_orthant(mean, covariance * n / (n + 1.0)) - _log_orthant(mean, covariance * n)
-
-
-def _log_orthant(mean: np.ndarray, covariance: np.ndarray) -> float:
-    """Return the log probability that a normal vector (k,) is positive.
-
-    It is no more than that of each entry, which is exact where the integral's own error is larger.
-    """
-    far = mean / np.sqrt(np.diag(covariance))
-    near, bound = far < _FAR, float(log_ndtr(far).min())  # the others are positive
-    if near.sum() <= 1 or bound < _HOPELESS:
-        return bound
-    block = covariance[np.ix_(near, near)]
-    chance = multivariate_normal.cdf(mean[near], mean=np.zeros(int(near.sum())), cov=block, rng=0)
-    return min(float(np.log(max(float(chance), 1e-300))), bound)
-
-
-def _moments(
-    least_squares: _LeastSquares,
-    sets: Sequence[tuple[int, ...]],
-    sds: np.ndarray,
-    weights: np.ndarray,
-) -> dict[int, tuple[float, float]]:
-    """Return mean and sd of each modulus where its term is present, signs not regarded."""
-    sums = np.zeros((len(least_squares.projected), 3))
-    for i, j in np.argwhere(weights > 1e-4 * weights.max()):
-        if S := sets[i]:
-            mean, inverse = least_squares.of(S)
-            second = sds[j] ** 2 * np.diag(inverse) + mean**2
-            sums[list(S)] += weights[i, j] * np.stack([np.ones(len(S)), mean, second], axis=1)
-    found = {}
-    for k in np.flatnonzero(sums[:, 0] > 0.0):
-        mean, second = sums[k, 1:] / sums[k, 0]
-        found[int(k)] = (float(mean), float(np.sqrt(max(second - mean**2, 0.0))))
-    return found
+    tests = {test: own for test, own in tests.items() if np.any(y[own])}
+    names, reports = list(terms.probabilities), list[HeldOut]()
+    for test, own in tests.items() if len(tests) > 1 else ():
+        rest = np.setdiff1d(np.arange(len(y)), own)
+        posterior, known = posterior_of_sets(G[rest], y[rest], names), seen_columns(G[rest])
+        # Errors correlate within a test, not between two, so its rows are whitened by themselves.
+        to_data = np.linalg.inv(white[np.ix_(own, own)])
+        to_data /= np.linalg.norm(to_data, axis=1)[:, None]  # each point in sds of its noise
+        data, columns = to_data @ y[own], to_data @ G[own]
+        number = {posterior.terms(i): i for i in range(len(posterior.sets))}
+        listed = [number[tuple(n for n in S if n in posterior.names)] for S, _ in terms.sets]
+        likely = np.flatnonzero(posterior.of_sets > _MINOR * posterior.of_sets.max())
+        by_set = {i: posterior.predicted(i, data, columns[:, known]) for i in {*likely, *listed}}
+        shares = posterior.of_sets[likely] / posterior.of_sets[likely].sum()
+        mean, below = (shares @ np.stack([by_set[i][k] for i in likely]) for k in (0, 1))
+        error = float(np.sqrt(np.mean((data - mean) ** 2)))
+        size = float(np.sqrt(np.mean(data**2)))
+        inside = float(np.mean(np.abs(below - 0.5) < 0.5 - _TAIL))
+        densities = [float(by_set[i][2].mean()) for i in listed]
+        alone = tuple(names[k] for k in seen_columns(columns) if k not in known)
+        errors = error / size, error / posterior.noise
+        reports.append(HeldOut(test, len(own), *errors, inside, densities, alone))
+    return reports

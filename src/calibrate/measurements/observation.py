@@ -146,6 +146,11 @@ class Observation(ABC):
         """The curves that the data are points of, by name: x (k,) and entries (k,) of the data."""
         return {}
 
+    @property
+    def data_of_tests(self) -> Mapping[str, np.ndarray]:
+        """The entries (k,) of the data of each of a specimen's tests, by its name."""
+        return {}
+
     def labels(self, name: str) -> Labels:
         """Return the labels of the data called ``name`` in the DataTree."""
         return {}, {}, {}

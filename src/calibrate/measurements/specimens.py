@@ -83,6 +83,12 @@ class SpecimenCurves(PointObservation):
         return sites if self.entries is None else Sites(*(each[self.entries] for each in sites))
 
     @property
+    def data_of_tests(self) -> Mapping[str, np.ndarray]:
+        """The entries (k,) of the data of each test."""
+        number = self.sites.positions[:, 1] / _APART
+        return {test: np.flatnonzero(number == k) for k, test in enumerate(self.tests)}
+
+    @property
     def curves(self) -> Mapping[str, tuple[np.ndarray, np.ndarray]]:
         """The curve of each test and component, over the way in stretch."""
         names = self.components or (self.name,)

@@ -13,7 +13,7 @@ import numpyro.distributions as dist
 from markupsafe import Markup
 
 from calibrate.analysis.identifiability import identify, in_words
-from calibrate.analysis.terms import find_terms
+from calibrate.analysis.terms import HeldOut, find_terms
 from calibrate.certificate.evidence import LARGEST_LOG_SD, LARGEST_MESH_SHIFT, LARGEST_SHIFT
 from calibrate.certificate.verdict import shifts
 from calibrate.posterior import Posterior
@@ -183,7 +183,12 @@ def _terms(posterior: Posterior) -> list[Markup]:
     told = "Which terms of the law do the data show? All sets of up to five, by their evidence."
     if found.undecided:
         told += f" The data do not tell of {', '.join(found.undecided)}."
-    return [parts.paragraph(told), parts.table(head, rows)]
+    blocks = [parts.paragraph(told), parts.table(head, rows)]
+    if found.held_out:
+        told = f"Each test left out in turn: {found.held_out_in_words()}."
+        tests = parts.table(HeldOut.head, (each.cells for each in found.held_out))
+        blocks += [parts.paragraph(told), tests]
+    return blocks
 
 
 def _provenance(run: Run, posterior: Posterior) -> list[Markup]:

@@ -5,10 +5,12 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from scipy.stats import truncnorm
 
 import calibrate as cal
 import emulator as em
-from calibrate.analysis.terms import _compared, find_terms
+from calibrate.analysis.term_sets import posterior_of_sets
+from calibrate.analysis.terms import Terms, _compared, _held_out, find_terms
 from calibrate.cli import main
 from emulator.core.errors import InputError
 from emulator.mechanics.laws.invariant_terms import TERMS
@@ -54,7 +56,7 @@ def test_probabilities_are_those_of_quadrature():
     rng = np.random.default_rng(2)
     G = np.column_stack([np.linspace(0.0, 1.0, 6), np.linspace(0.0, 1.0, 6) ** 2])
     y = G @ [0.7, 0.4] + 0.1 * rng.normal(size=6)
-    found = _compared(G, y, ["one", "two"], ["one", "two"])
+    found = _compared(G, y, ["one", "two"])
     size = np.sqrt(np.mean(y**2))
     sds, c = np.geomspace(1e-3 * size, size / 3.0, 400), np.linspace(0.0, 4.0, 801) + 0.0025
     sums = {}
@@ -83,40 +85,105 @@ def test_probabilities_are_those_of_quadrature():
 
 @pytest.fixture(scope="module")
 def twins():
-    """A model of seven columns of data, and data of three terms with 3 % noise."""
-    model = model_of(scene_of())
-    moduli = dict.fromkeys(TERMS, 0.0) | {"I1": 8.0, "f_2": 20.0, "fs_2": 10.0}
-    theta = np.array([moduli[name] for name in TERMS])
-    exact = np.asarray(model.observe.parts["stress"](model.forward(theta), theta))
-    rng = np.random.default_rng(1)
-    return model, exact + 0.03 * np.sqrt(np.mean(exact**2)) * rng.normal(size=exact.shape)
+    """A model of five tests, and data with 3 % noise: of three terms, and without their shear."""
+    model, data = model_of(scene_of()), []
+    for moduli in ({"I1": 8.0, "f_2": 20.0, "fs_2": 10.0}, {"I1": 8.0, "f_2": 20.0}):
+        theta = np.array([moduli.get(name, 0.0) for name in TERMS])
+        exact = np.asarray(model.observe.parts["stress"](model.forward(theta), theta))
+        noise = np.random.default_rng(1).normal(size=exact.shape)
+        data.append(exact + 0.03 * np.sqrt(np.mean(exact**2)) * noise)
+    return model, *data
 
 
 def test_terms_of_a_twin_are_found(twins):
-    model, data = twins
+    model, data, _ = twins
     found = find_terms(model, data)
     present = {name for name, chance in found.probabilities.items() if chance > 0.5}
     assert present == {"I1", "f_2", "fs_2"}
     assert found.moduli["f_2"][0] == pytest.approx(20.0, abs=4.0 * found.moduli["f_2"][1])
     assert found.sets[0][0] == ("I1", "f_2", "fs_2")
     assert found.noise == pytest.approx(0.3 * np.sqrt(np.mean(data**2)), rel=0.2)
+    # Fibres and sheets shear in one test: the others cannot predict it, and predict one another.
+    *others, shear = sorted(found.held_out, key=lambda each: each.test == "xy")
+    assert shear.inside < 0.6 < 0.85 < min(each.inside for each in others)
+    assert shear.in_noise > 5.0 > 1.3 > max(each.in_noise for each in others)
+    assert shear.alone == ("fs_2", "fs_e")
+    assert "do not predict 'xy', which alone shows fs_2, fs_e" in str(found)
+
+
+def test_a_twin_whose_tests_predict_one_another(twins):
+    model, _, data = twins
+    found = find_terms(model, data)
+    assert [each.test for each in found.held_out] == ["equal", "x", "y", "xy", "xz"]
+    assert min(each.inside for each in found.held_out) > 0.8
+    assert max(each.in_noise for each in found.held_out) < 1.3
+    words = "each test is predicted by the others; no other set predicts better than"
+    assert found.held_out_in_words().startswith(words)
+    expected = -0.5 * np.log(2.0 * np.pi * np.e) - np.log(found.noise)
+    assert found.log_densities[0] == pytest.approx(expected, abs=0.1)
+
+
+def test_a_set_predicts_by_positive_moduli():
+    """One modulus, half an sd above zero: the mean of a normal variable that is cut there."""
+    g = np.linspace(0.1, 1.0, 20)[:, None]
+    y = np.random.default_rng(6).normal(size=20)
+    y += (0.5 / np.sqrt(g[:, 0] @ g[:, 0]) - g[:, 0] @ y / (g[:, 0] @ g[:, 0])) * g[:, 0]
+    posterior = posterior_of_sets(g, y, ["one"])
+    mean, below, _ = posterior.predicted(1, np.zeros(1), g[-1:])
+    sd = np.sqrt(20.0 / 21.0 / (g[:, 0] @ g[:, 0])) * (posterior.weights[1] @ posterior.sds)
+    sd /= posterior.weights[1].sum()
+    centre = g[:, 0] @ y / (g[:, 0] @ g[:, 0])
+    exact = truncnorm(-centre / sd, np.inf, loc=centre, scale=sd).mean()
+    assert mean[0] == pytest.approx(exact, rel=0.15)
+    assert below[0] < 0.5
+
+
+def test_bands_of_tests_whose_errors_correlate_hold_nine_points_in_ten():
+    g = np.linspace(0.1, 1.0, 12)
+    columns = np.concatenate([np.stack([g, g**3], axis=1) * k for k in (1.0, 2.0, 0.5)])
+    within = 0.05**2 * (np.exp(-np.abs(g[:, None] - g) / 0.3) + 0.3 * np.eye(12))
+    covariance = np.kron(np.eye(3), within)
+    white = np.linalg.cholesky(np.linalg.inv(covariance)).T
+    tests = {name: np.arange(12 * k, 12 * k + 12) for k, name in enumerate("abc")}
+    rng, inside, errors = np.random.default_rng(8), [], []
+    for _ in range(40):
+        data = columns @ [0.0, 1.0] + rng.multivariate_normal(np.zeros(36), covariance)
+        G, y = white @ columns, white @ data
+        reports = _held_out(tests, white, G, y, _compared(G, y, "ab"))
+        inside += [each.inside for each in reports]
+        errors += [each.in_noise for each in reports]
+    assert np.mean(inside) == pytest.approx(0.9, abs=0.04)
+    assert 1.0 < np.sqrt(np.mean(np.square(errors))) < 1.3  # moduli are not known, either
+
+
+def test_another_set_that_predicts_better_is_named():
+    g = np.linspace(0.1, 1.0, 10)
+    G = np.tile(np.stack([g, g**2], axis=1), (3, 1))
+    y = G @ [0.0, 1.0] + 0.02 * np.random.default_rng(5).normal(size=30)
+    tests = {name: np.arange(10 * k, 10 * k + 10) for k, name in enumerate("abc")}
+    terms = Terms({"a": 0.5, "b": 0.5}, [(("a",), 0.6), (("b",), 0.4)], {}, 1.0)
+    found = Terms(**vars(terms) | {"held_out": _held_out(tests, np.eye(30), G, y, terms)})
+    assert found.held_out_in_words().endswith("b predicts better than the likeliest set")
+    assert _held_out({"all": np.arange(30)}, np.eye(30), G, y, terms) == []
 
 
 def test_terms_that_do_the_same_share_their_probability():
     g = np.linspace(0.0, 1.0, 20)
     y = 2.0 * g + 0.02 * np.random.default_rng(0).normal(size=20)
-    found = _compared(np.column_stack([g, 3.0 * g, g**3]), y, "abc", "abcd")
+    found = _compared(np.column_stack([g, 3.0 * g, g**3, 0.0 * g]), y, "abcd")
     assert found.probabilities["a"] == pytest.approx(found.probabilities["b"], abs=1e-3)
     assert 0.4 < found.probabilities["a"] < 0.8
     assert found.probabilities["d"] == 0.25  # the data do not have it
     assert {"a", "b", "d"} <= set(found.undecided)
     assert "undecided" in str(found)
+    assert not found.held_out
+    assert "held out" not in str(found)
 
 
 def test_a_set_that_needs_a_negative_modulus_is_not_taken():
     g = np.linspace(0.1, 1.0, 30)
     y = 2.0 * g - 0.8 * g**3 + 0.005 * np.random.default_rng(4).normal(size=30)
-    found = _compared(np.column_stack([g, g**3, g**0.5]), y, "abc", "abc")
+    found = _compared(np.column_stack([g, g**3, g**0.5]), y, "abc")
     assert found.probabilities["b"] < 0.1
     assert min(mean for name, (mean, _) in found.moduli.items() if name != "b") > 0.0
     assert found.probabilities["a"] > 0.99
@@ -163,7 +230,7 @@ def test_what_is_not_linear_is_refused(scale, fibre, noise, words):
 
 def test_by_command(tmp_path, capsys, monkeypatch, twins):
     monkeypatch.chdir(tmp_path)
-    _, data = twins
+    _, data, _ = twins
     lines = ["protocol,stretch_x,stretch_y,shear_xy,shear_xz,cauchy_x,cauchy_y,cauchy_xy,cauchy_xz"]
     names = [n for n in ("equal", "x", "y", "xy", "xz") for _ in range(8)]
     for name, H, row in zip(names, GIVEN.gradients, data, strict=True):
@@ -175,3 +242,4 @@ def test_by_command(tmp_path, capsys, monkeypatch, twins):
     assert main(["terms", "test.toml", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert max(found["probabilities"], key=found["probabilities"].get) in ("I1", "f_2", "fs_2")
+    assert {each["test"] for each in found["held_out"]} == {"equal", "x", "y", "xy", "xz"}

@@ -15,6 +15,7 @@ from calibrate.report import charts
 from calibrate.report.body import body_figure
 from calibrate.report.page import html_of
 from calibrate.samplers.laplace import LaplaceOptions
+from emulator.scenes.states import states
 
 pytestmark = pytest.mark.slow  # compiling for a ventricle; test_command.py is quick
 
@@ -198,9 +199,9 @@ def test_in_a_browser(page, tmp_path):
 
 
 def test_the_page_of_a_specimen_says_which_terms_its_law_needs():
-    stretch = np.linspace(1.02, 1.3, 8)
+    stretch = np.tile(np.linspace(1.02, 1.3, 4), 2)
     scene = em.specimen(
-        {"stretch_x": stretch, "stretch_y": stretch},
+        states({"stretch_x": stretch, "stretch_y": stretch}, ["first"] * 4 + ["second"] * 4),
         law=em.find_law("mooney_rivlin"),
         parameters=tuple(em.Parameter(f"c_{k}", "kPa", 0.01, 20.0) for k in ("10", "01")),
         constants={"kappa": 1000.0},
@@ -215,3 +216,5 @@ def test_the_page_of_a_specimen_says_which_terms_its_law_needs():
     rows = dict(re.findall(r"<tr><td>(c_[01]+)</td><td>([0-9.]+)</td>", text))
     assert float(rows["c_10"]) > 0.95
     assert float(rows["c_01"]) < 0.5
+    assert "Each test left out in turn: each test is predicted by the others; no other set" in text
+    assert re.search(r"<tr><td>second</td><td>8</td><td>[0-9.]+ %</td>", text)

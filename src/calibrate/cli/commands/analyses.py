@@ -194,15 +194,23 @@ def _effects_in_words(recommendation: Recommendation) -> str:
     "calibrate terms biaxial.toml",
 )
 def terms(arguments: Namespace) -> Answer:
-    """Compare all sets of terms by their evidence."""
-    from calibrate.analysis.terms import find_terms
+    """Compare all sets of terms by their evidence, and by tests that are left out."""
+    from calibrate.analysis.terms import HeldOut, find_terms
     from calibrate.cli.run_words import problem_of
     from calibrate.project.problem import build_model, with_data
 
     found = find_terms(*build_model(with_data(problem_of(arguments))))
-    lines = [str(found), "likeliest sets:"]
-    lines += [f"  {chance:.3f}  {', '.join(names) or 'none'}" for names, chance in found.sets]
-    return Answer(asdict(found), "\n".join(lines))
+    columns: list[list[str]] = [
+        [", ".join(names) or "none" for names, _ in found.sets],
+        [f"{chance:.3f}" for _, chance in found.sets],
+    ]
+    head, tables = ["likeliest sets", "probability"], list[str]()
+    if found.held_out:
+        head.append("log density of a held-out point")
+        columns.append([f"{x:.2f}" for x in found.log_densities])
+        tables = [table(HeldOut.head, (each.cells for each in found.held_out))]
+    sets = table(head, zip(*columns, strict=True))
+    return Answer(asdict(found), "\n\n".join([str(found), sets, *tables]))
 
 
 _SAMPLES = {"sobol": 512, "morris": 64, "derivatives": 256}
