@@ -211,7 +211,7 @@ def _check_places(surfaces: Sequence[Surface]) -> None:
                 f"{each.name} and {outer.name} are swapped: the epicardium lies within it"
             )
         out = ~inside(whole[outer.name], each.points, up)
-        rims = cKDTree(outer.points[np.concatenate(rim_loops(outer))], balanced_tree=False)
+        rims = cKDTree(each.points[np.concatenate(rim_loops(each))], balanced_tree=False)
         out &= rims.query(each.points)[0] > _LEAST  # where surfaces meet, round-off decides
         if out.all():
             raise InputError(

@@ -218,10 +218,7 @@ class ValvePressure(FollowingPressure):
     def on_loaded(
         self, grid: Discretisation, fibres: Fibres | None = None
     ) -> tuple[LocalForce, ...]:
-        return (
-            *FollowerPressure(**vars(self)).on_loaded(grid),
-            *(_as_loaded(term) for term in self._of_lids(grid)),
-        )
+        return tuple(_as_loaded(term) for term in self.terms(grid))
 
     def _of_lids(self, grid: Discretisation) -> list[LocalTerm]:
         """Return the potential of the pressure on each lid, one group of all nodes of its rim."""

@@ -1,0 +1,197 @@
+"""Both ventricles from three surfaces: a generator's, with valves anywhere, and a scanner's."""
+
+import numpy as np
+import pytest
+
+from cli_support import complaint
+from emulator.core.errors import InputError
+from emulator.geometry.facets import Cavity
+from emulator.geometry.generators.biventricle import biventricle
+from emulator.geometry.generators.ellipsoid import HUMAN
+from emulator.geometry.heart import mesh_heart, zipped
+from emulator.geometry.remeshing import triangulate
+from emulator.geometry.surfaces import Surface, clipped, rim_loops, surface
+from emulator.scenes.draft import draft_scene
+from emulator.scenes.fibre_rules import Biventricle
+from surface_support import write
+
+SETS = ("lv_endocardium", "rv_endocardium", "epicardium")
+FRAMES = range(0, 25, 2)
+LID = 3.0  # mm of tissue above the cavities of a heart with valves
+
+
+def needs_gmsh():
+    pytest.importorskip("gmsh", reason="no gmsh here", exc_type=(ImportError, OSError))
+
+
+@pytest.fixture(scope="module")
+def flat():
+    """Left and right endocardium and epicardium of an idealised heart, cut off at the base."""
+    mesh = biventricle(rings=16, around=40)
+    return [surface(name, mesh.nodes, mesh.facet_set(name)) for name in SETS]
+
+
+def with_lid(cup, height, holes):
+    """A cup with flat lid, so many mm above its rim, and round ``holes``: middle and radius."""
+    (loop,) = rim_loops(cup)
+    rim = cup.points[loop]
+    points, rows = [cup.points], [cup.triangles]
+    if height:
+        points.append(rim + [0.0, 0.0, height])
+        upper = len(cup.points) + np.arange(len(loop))
+        rows.append(zipped(np.vstack(points), loop, upper))
+        loop = upper
+    turn = 2.0 * np.pi * np.arange(24) / 24
+    circles = [
+        middle + radius * np.column_stack([np.cos(turn), np.sin(turn)]) for middle, radius in holes
+    ]
+    flat, triangles = triangulate([rim[:, :2], *circles], 4.0)
+    inner = flat[len(loop) :]
+    count = sum(map(len, points))
+    number = np.concatenate([loop, np.arange(count, count + len(inner))])
+    level = np.full((len(inner), 1), rim[:, 2].mean() + height)
+    points.append(np.hstack([inner, level]))
+    return surface(cup.name, np.vstack(points), np.vstack([*rows, number[triangles]]))
+
+
+def with_valves(flat, seed):
+    """The idealised heart with a lid of tissue and two valves in each ventricle, anywhere in it."""
+    rng = np.random.default_rng(seed)
+    turn = rng.uniform(-0.5, 0.5)
+    left = flat[0].points[rim_loops(flat[0])[0]]
+    right = flat[1].points[rim_loops(flat[1])[0]]
+    middle, reach = left[:, :2].mean(axis=0), np.ptp(left[:, 0]) / 2.0
+    away = np.array([np.cos(turn), np.sin(turn)])
+    holes = [(middle - 0.42 * reach * away, 0.4 * reach), (middle + 0.5 * reach * away, 0.3 * reach)]
+    # The right ventricle is a crescent: valves along the middle of its width.
+    about = np.arctan2(*(right[:, :2] - middle).T[::-1])
+    places = []
+    for share in (rng.uniform(0.25, 0.35), rng.uniform(0.65, 0.75)):
+        angle = about.min() + share * np.ptp(about)
+        near = np.abs(about - angle) < 0.15
+        places.append((right[near, :2].mean(axis=0), rng.uniform(3.5, 4.5)))
+    return [
+        with_lid(flat[0], 0.0, holes),
+        with_lid(flat[1], 0.0, places),
+        with_lid(flat[2], LID, [*holes, *places]),
+    ]
+
+
+def test_a_heart_with_a_flat_base(flat):
+    needs_gmsh()
+    found = mesh_heart(*flat, size=9.0)
+    assert set(found.cavities) == set(SETS[:2])
+    for cavity, own in found.cavities.values():
+        assert cavity == pytest.approx(own, rel=0.01)
+    base = found.mesh.nodes[found.mesh.node_set("base")]
+    np.testing.assert_allclose(base[:, 2], HUMAN.base, atol=1e-6)
+    assert found.quality.flat == 0
+    assert found.quality.parts == 1
+    np.testing.assert_allclose(found.axis, [0.0, 0.0, 1.0], atol=1e-6)
+    fibres, _ = Biventricle((60.0, -60.0)).directions(found.mesh)
+    assert np.isfinite(fibres).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(20))
+def test_valves_may_be_anywhere(flat, seed):
+    needs_gmsh()
+    surfaces = with_valves(flat, seed)
+    found = mesh_heart(*surfaces, size=7.0)
+    sets = found.mesh.facet_sets
+    assert {"mitral", "aortic", "tricuspid", "pulmonary", "base"} < set(sets)
+    for name, (cavity, own) in found.cavities.items():
+        assert cavity == pytest.approx(own, rel=0.01)
+        assert Cavity(found.mesh, name).rest == cavity
+    assert len(sets["base"]) == sum(len(sets[n]) for n in set(sets) - {*SETS, "base"})
+    assert found.wall[0] == pytest.approx(found.wall[1], rel=0.02)
+    assert found.quality.flat == 0
+
+
+def moved(each, shift):
+    return Surface(each.name, each.points + shift, each.triangles)
+
+
+def holed(each, place, radius=6.0):
+    return clipped(each, radius - np.linalg.norm(each.points - place, axis=1))
+
+
+def closed_cup(each):
+    return surface(each.name, each.points, biventricle(rings=8, around=16).surface)
+
+
+def doubled(each):
+    points = np.vstack([each.points, each.points + 300.0])
+    return [points, np.vstack([each.triangles, each.triangles + len(each.points)])]
+
+
+def bad(flat):
+    """Three surfaces that are no heart, words, and what is said."""
+    left, right, outer = flat
+    apex = left.points[np.argmin(left.points[:, 2])]
+    outside = outer.points[np.argmin(outer.points[:, 2])]
+    yield (outer, right, left), {}, "lv_endocardium and epicardium are swapped"
+    yield (left, left, outer), {}, "are one surface; give three"
+    yield (left, right, left), {}, "are one surface; give three"
+    yield (left, moved(left, 0.0), outer), {}, "are one surface; give three"
+    yield (holed(left, apex), right, outer), {}, "no opening of the epicardium is at its opening"
+    yield (left, right, holed(outer, outside)), {}, "neither endocardium has an opening at that"
+    twice = holed(holed(left, apex), left.points[len(left.points) // 2])
+    yield (twice, right, outer), {}, "it has 3 openings, the smallest of"
+    yield (left, moved(right, [-12.0, 0.0, 0.0]), outer), {}, "crosses"
+    yield (moved(left, [0.0, 14.0, 0.0]), right, outer), {}, "crosses"
+    yield (moved(left, 400.0), right, outer), {}, "no opening of the epicardium is at its opening"
+    small = [Surface(e.name, e.points / 1000.0, e.triangles) for e in flat]
+    yield small, {}, "mm from corner to corner, lengths being taken as mm"
+    yield flat, {"unit": "feet"}, "unit 'feet'"
+    yield flat, {"size": 80.0}, "below a quarter of the epicardium's"
+    yield flat, {"order": 3}, "order 3: expected 1 or 2"
+    yield flat, {"least": 0.0}, "above 0 mm"
+
+
+@pytest.mark.parametrize("number", range(15))
+def test_what_is_no_heart_is_refused(flat, number):
+    surfaces, words, said = list(bad(flat))[number]
+    named = [
+        Surface(name, each.points, each.triangles)
+        for name, each in zip(SETS, surfaces, strict=True)
+    ]
+    with pytest.raises(InputError, match=said):
+        mesh_heart(*named, **words)
+
+
+def test_by_the_command_line_to_a_scene(flat, tmp_path, capsys):
+    needs_gmsh()
+    from calibrate.cli import main
+
+    files = [
+        str(write(tmp_path / f"{each.name}.stl", each.points[each.triangles])) for each in flat
+    ]
+    out = str(tmp_path / "heart.vtu")
+    words = ["mesh", "--endocardium", files[0], "--right", files[1], "--epicardium", files[2]]
+    assert main([*words, "--out", out, "--size", "11"]) == 0
+    assert "cavity of rv_endocardium" in capsys.readouterr().out
+    draft = draft_scene(out, tmp_path / "heart.toml")
+    assert draft.scene.parameter_names[-2:] == ("pressure", "right_pressure")
+    assert 'rule = "biventricle"' in draft.path.read_text()
+    swapped = ["mesh", "--endocardium", files[2], "--right", files[1], "--epicardium", files[0]]
+    assert "are swapped" in complaint(capsys, *swapped, "--out", out)
+
+
+@pytest.mark.slow
+def test_every_frame_of_a_real_heart_is_meshed(measured):
+    needs_gmsh()
+    folder = measured / "human_heart"
+    walls = []
+    for frame in FRAMES:
+        files = (f"{n}_{frame:03d}.obj" for n in ("LV_ENDOCARDIAL", "RV_ENDOCARDIAL", "EPICARDIAL"))
+        found = mesh_heart(*(folder / name for name in files))
+        for cavity, own in found.cavities.values():
+            assert cavity == pytest.approx(own, rel=6e-3)
+        assert found.wall[0] == pytest.approx(found.wall[1], abs=2.0)  # mL, of thin walls and rims
+        assert found.moved < 1.5
+        assert found.quality.angle > 3.0
+        assert found.quality.parts == 1
+        walls.append(found.wall[0])
+    # Muscle keeps its volume; the surfaces were fitted to images, each frame by itself.
+    assert np.ptp(walls) < 0.25 * np.mean(walls)
