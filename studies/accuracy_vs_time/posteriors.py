@@ -98,9 +98,6 @@ WAYS = {
     "series + discrepancy, 20 FEM runs, Laplace": Way(
         "emulator", _mechanics(20), entries.sampler("laplace")
     ),
-    "series + discrepancy, 5 FEM runs, delayed acceptance": Way(
-        "FEM", _mechanics(5), entries.sampler("delayed_acceptance")
-    ),
     "FEM, NUTS": Way("FEM", _fem, FEW),
 }
 

@@ -5,7 +5,6 @@ from dataclasses import fields
 from typing import Any
 
 from calibrate.samplers.chains import ChainSampler
-from calibrate.samplers.delayed_acceptance import DELAYED_ACCEPTANCE, DelayedAcceptanceOptions
 from calibrate.samplers.density import Density, density_of, named_draws
 from calibrate.samplers.diagnostics import r_hat
 from calibrate.samplers.importance import AUTO, IMPORTANCE, AutoOptions, ImportanceOptions
@@ -17,9 +16,7 @@ from calibrate.samplers.smc import SMC, SMCOptions
 from emulator.core.errors import InputError, look_up
 from emulator.core.schema import Source, parse, table_of
 
-_ALL: tuple[Sampler, ...] = (
-    AUTO, IMPORTANCE, NUTS, BLACKJAX_NUTS, MCLMC, DELAYED_ACCEPTANCE, SMC, LAPLACE,
-)  # fmt: skip
+_ALL: tuple[Sampler, ...] = (AUTO, IMPORTANCE, NUTS, BLACKJAX_NUTS, MCLMC, SMC, LAPLACE)
 SAMPLERS: dict[str, Sampler] = {sampler.name: sampler for sampler in _ALL}
 
 __all__ = [
@@ -29,7 +26,6 @@ __all__ = [
     "ChainOptions",
     "ChainSampler",
     "Context",
-    "DelayedAcceptanceOptions",
     "Density",
     "Draws",
     "ImportanceOptions",

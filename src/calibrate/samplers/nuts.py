@@ -3,8 +3,7 @@
 Which of the two is faster depends on the posterior: BlackJAX's on landmarks and strains, NumPyro's
 on a volume (studies/decoder_speed). NumPyro's kernel adapts step size and metric in its first steps
 and is compiled once a model, where its ``MCMC`` class compiles for every run. BlackJAX's runs
-Stan's window adaptation in ``init``, after which its transitions are reversible, as delayed
-acceptance needs them.
+Stan's window adaptation in ``init``.
 """
 
 from __future__ import annotations

@@ -17,7 +17,6 @@ import jax
 
 from calibrate.samplers.checkpoint import Checkpoint
 from calibrate.samplers.diagnostics import ENOUGH_ESS, RUN_UNTIL_R_HAT, converged
-from calibrate.statistical_model import FEMLikelihood
 from emulator.core.errors import InputError
 
 RANDOM, PATHFINDER = "random", "pathfinder"
@@ -30,14 +29,11 @@ class Draws(NamedTuple):
     """Draws ``z`` (chains, draws, p) in unconstrained coordinates; statistics (chains, draws).
 
     attributes : facts of the whole run, plain JSON, e.g. ``log_evidence``.
-    means : data without noise at the draws, (chains, draws, *shape) by the observation's name, from
-        a sampler that draws from FEM's posterior in place of the model's own.
     """
 
     z: Any
     statistics: Statistics
     attributes: Mapping[str, Any] = {}
-    means: Mapping[str, Any] | None = None
 
 
 class Context(NamedTuple):
@@ -46,13 +42,11 @@ class Context(NamedTuple):
     seed : the seed of all random numbers.
     progress : whether a progress bar is shown.
     checkpoint : the file that the run's state is written to, and restored from after a kill.
-    fem : FEM's log likelihood, for samplers with FEM in a second stage.
     """
 
     seed: int = 0
     progress: bool = False
     checkpoint: Checkpoint = Checkpoint()
-    fem: FEMLikelihood | None = None
 
 
 @dataclass(frozen=True)
@@ -67,9 +61,6 @@ class Sampler(ABC):
     name: str
     options: type[Any]
     statistics: tuple[str, ...]
-
-    solves_fem: ClassVar[bool] = False
-    """Whether the sampler needs FEM's likelihood (:attr:`Context.fem`)."""
 
     @abstractmethod
     def sample(self, density: Any, data: Any, options: Any, context: Context) -> Draws:

@@ -17,9 +17,9 @@ from calibrate.samplers import (
 from calibrate.samplers.density import density_of
 from emulator.core.errors import InputError
 from emulator.surrogates.fem import fem_forward
-from linear_support import PRIOR_MEAN, PRIOR_SD, LinearFEM, closed_form, linear_problem
+from linear_support import PRIOR_MEAN, PRIOR_SD, closed_form, linear_problem
 
-LONG = ("blackjax_nuts", "delayed_acceptance", "mclmc")
+LONG = ("blackjax_nuts", "mclmc")
 
 
 @pytest.fixture(scope="module")
@@ -33,12 +33,8 @@ def problem(beam):
 )
 def test_a_linear_gaussian_posterior_is_the_known_one(name, problem, beam):
     model, data = problem
-    # FEM in a second stage: a draw costs a solve, and is nearly independent of the one before.
-    draws = 250 if find_sampler(name).solves_fem else 1000
-    options = options_from(find_sampler(name), {}, warmup=400, draws=draws, chains=4)
-    posterior = cal.sample(
-        model, data, sampler=name, options=options, seed=1, simulator=LinearFEM(beam, model.full)
-    )
+    options = options_from(find_sampler(name), {}, warmup=400, draws=1000, chains=4)
+    posterior = cal.sample(model, data, sampler=name, options=options, seed=1)
     nodes = model.observe.nodes
     mean, covariance = closed_form(model.full, nodes, data, 0.1, PRIOR_MEAN, PRIOR_SD)
     draws, table = posterior.draws(), posterior.summary()

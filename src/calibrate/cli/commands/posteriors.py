@@ -42,7 +42,7 @@ def infer(arguments: Namespace) -> Answer:
             plan, folder, certify=certify, force=force, progress=progress
         )
         result = members_report(hierarchy, verdicts)
-        usable = {*verdicts.values()} <= {"accepted", "decided by FEM"}
+        usable = {*verdicts.values()} <= {"accepted"}
         return Answer(result, f"{members_summary(result)}\n{written}", usable)
     problem = read_problem(plan)
     run, (sampler, options) = problem.run, problem.run.sampling()
@@ -52,7 +52,7 @@ def infer(arguments: Namespace) -> Answer:
         )
     posterior = infer(problem, folder, force=force, check_map=not certify, progress=progress)
     certificate = None
-    if certify and not sampler.solves_fem:
+    if certify:
         certificate = certify_and_keep(
             posterior, folder, load_steps=run.load_steps, progress=progress
         )
