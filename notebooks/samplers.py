@@ -16,8 +16,8 @@
 #
 # 1. BlackJAX, with a kernel of yours on the toolkit's log density;
 # 2. NumPyro, with the forward map inside a model of yours;
-# 3. `cal.sample` with one of its samplers: importance sampling, NUTS of NumPyro or BlackJAX, MCLMC, SMC, and the
-#    Laplace approximation.
+# 3. `cal.sample` with one of its samplers: importance sampling, NUTS of NumPyro or BlackJAX, SMC, and the Laplace
+#    approximation.
 #
 # At the end all are compared by effective draws a second, and by what they would cost with FEM in place of the emulator.
 
@@ -168,7 +168,6 @@ OPTIONS = {
     "importance": cal.ImportanceOptions(draws=400),
     "nuts": cal.NUTSOptions(**size, rounds=1),
     "blackjax_nuts": cal.BlackJAXNUTSOptions(**size, rounds=1),
-    "mclmc": cal.MCLMCOptions(**size, rounds=1),
     "smc": cal.SMCOptions(draws=300, transitions=5),
     "laplace": cal.LaplaceOptions(draws=400),
 }
@@ -285,4 +284,4 @@ assert certificate.verdict == "accepted"
 #
 # Which sampler? `auto`, the default, unless there is a reason. For up to eight unknowns it takes `importance`, which sees the
 # whole prior, finds several modes and gives the evidence; for more, `nuts`. `smc` finds several modes among many unknowns,
-# `mclmc` is for many parameters, `laplace` for a first look.
+# `laplace` is for a first look.

@@ -89,9 +89,6 @@ WAYS = {
     **{f"POD + GP, {n} FEM runs, NUTS": Way("POD + GP", _reduced(n)) for n in (10, 30, 60)},
     "POD + GP, 60 FEM runs, NumPyro's NUTS": Way("POD + GP", _reduced(60), by_numpyro),
     "network alone, NUTS": Way("network", _network, before_s=lambda: entries.NETWORK()[1]),
-    "series + discrepancy, 20 FEM runs, MCLMC": Way(
-        "emulator", _mechanics(20), entries.sampler("mclmc")
-    ),
     "series + discrepancy, 20 FEM runs, SMC": Way(
         "emulator", _mechanics(20), entries.sampler("smc")
     ),

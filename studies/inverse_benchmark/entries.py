@@ -141,7 +141,6 @@ OURS = {
     "pod_gp_nuts": Entry(
         f"POD + GP of {RUNS} runs, NUTS", reduced, sampler("nuts", **_NUTS)
     ),
-    "emulator_mclmc": Entry("emulator, MCLMC", EMULATOR, sampler("mclmc", **_NUTS)),
     "emulator_smc": Entry("emulator, SMC", EMULATOR, sampler("smc")),
     "pymc": Entry("emulator, PyMC", EMULATOR, by_pymc),
 }  # fmt: skip

@@ -9,14 +9,13 @@ from calibrate.samplers.density import Density, density_of, named_draws
 from calibrate.samplers.diagnostics import r_hat
 from calibrate.samplers.importance import AUTO, IMPORTANCE, AutoOptions, ImportanceOptions
 from calibrate.samplers.laplace import LAPLACE, LaplaceOptions
-from calibrate.samplers.mclmc import MCLMC, MCLMCOptions
 from calibrate.samplers.nuts import BLACKJAX_NUTS, NUTS, BlackJAXNUTSOptions, NUTSOptions
 from calibrate.samplers.protocol import ChainOptions, Context, Draws, Kernel, Sampler
 from calibrate.samplers.smc import SMC, SMCOptions
 from emulator.core.errors import InputError, look_up
 from emulator.core.schema import Source, parse, table_of
 
-_ALL: tuple[Sampler, ...] = (AUTO, IMPORTANCE, NUTS, BLACKJAX_NUTS, MCLMC, SMC, LAPLACE)
+_ALL: tuple[Sampler, ...] = (AUTO, IMPORTANCE, NUTS, BLACKJAX_NUTS, SMC, LAPLACE)
 SAMPLERS: dict[str, Sampler] = {sampler.name: sampler for sampler in _ALL}
 
 __all__ = [
@@ -31,7 +30,6 @@ __all__ = [
     "ImportanceOptions",
     "Kernel",
     "LaplaceOptions",
-    "MCLMCOptions",
     "NUTSOptions",
     "SMCOptions",
     "Sampler",

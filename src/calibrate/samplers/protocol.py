@@ -95,41 +95,6 @@ class Kernel(NamedTuple):
     step: Callable[..., tuple[Any, jax.Array, Statistics]]
 
 
-class TunedState(NamedTuple):
-    """State of a kernel whose ``init`` adapts: random key, BlackJAX's state, fixed parameters."""
-
-    rng_key: jax.Array
-    state: Any
-    step_size: jax.Array
-    inverse_mass_matrix: jax.Array
-
-
-def tuned_step(
-    log_density: Callable[..., jax.Array],
-    transition: Callable[..., Any],
-    statistics: Mapping[str, str] = {},
-    **options: Any,
-) -> Callable[..., tuple[TunedState, jax.Array, Statistics]]:
-    """Return the ``step`` of a :class:`Kernel` by BlackJAX's ``transition``.
-
-    statistics : further statistics, with the name of each in BlackJAX's information.
-    """
-    names = {"diverging": "is_divergent", "acceptance_rate": "acceptance_rate"}
-    names |= {"n_steps": "num_integration_steps", **statistics}
-
-    def step(state: TunedState, *arguments: Any) -> tuple[TunedState, jax.Array, Statistics]:
-        transition_key, next_key = jax.random.split(state.rng_key)
-        inner, info = transition(
-            transition_key, state.state, lambda zeta: log_density(zeta, *arguments),
-            step_size=state.step_size, inverse_mass_matrix=state.inverse_mass_matrix, **options,
-        )  # fmt: skip
-        values = {name: getattr(info, theirs) for name, theirs in names.items()}
-        values["lp"] = inner.logdensity
-        return state._replace(rng_key=next_key, state=inner), inner.position, values
-
-    return step
-
-
 @dataclass(frozen=True)
 class Options:
     """Settings of a sampler: whole numbers of 1 or more, and ``shares`` in (0, 1)."""

@@ -19,7 +19,7 @@ from emulator.core.errors import InputError
 from emulator.surrogates.fem import fem_forward
 from linear_support import PRIOR_MEAN, PRIOR_SD, closed_form, linear_problem
 
-LONG = ("blackjax_nuts", "mclmc")
+LONG = ("blackjax_nuts",)
 
 
 @pytest.fixture(scope="module")
