@@ -19,8 +19,6 @@ from calibrate.samplers.checkpoint import Checkpoint
 from calibrate.samplers.diagnostics import ENOUGH_ESS, RUN_UNTIL_R_HAT, converged
 from emulator.core.errors import InputError
 
-RANDOM, PATHFINDER = "random", "pathfinder"
-
 Statistics = Mapping[str, Any]
 """Statistics by ArviZ's names: ``diverging``, ``acceptance_rate``, ``n_steps``, ``lp``, ..."""
 
@@ -124,8 +122,6 @@ class ChainOptions(Options):
     chains : the number of independent chains.
     rounds : the largest number of rounds; another one begins while R-hat or ESS miss their limits.
     r_hat, ess : the largest R-hat, and smallest bulk and tail ESS of any parameter, to stop at.
-    start : where chains start: ``random``, within two units of the centre, or ``pathfinder``
-        (:func:`calibrate.samplers.chains.pathfinder_start`).
     """
 
     warmup: int = 500
@@ -134,13 +130,5 @@ class ChainOptions(Options):
     rounds: int = 8
     r_hat: float = RUN_UNTIL_R_HAT
     ess: float = ENOUGH_ESS
-    start: str = RANDOM
 
     label: ClassVar[str] = "chains"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.start not in (RANDOM, PATHFINDER):
-            raise InputError(
-                f"{self.label}: start is '{self.start}'; it is {RANDOM} or {PATHFINDER}"
-            )

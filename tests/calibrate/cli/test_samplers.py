@@ -71,5 +71,5 @@ def test_options_that_cannot_be(words, message, capsys, tmp_path):
 
 
 def test_options_reach_the_sampler():
-    words = ["target_accept=0.95", "rounds=2", "start=pathfinder"]
-    assert sampler_options(words) == {"target_accept": 0.95, "rounds": 2, "start": "pathfinder"}
+    words = ["target_accept=0.95", "rounds=2"]
+    assert sampler_options(words) == {"target_accept": 0.95, "rounds": 2}

@@ -87,8 +87,8 @@ def test_as_many_chains_at_once_as_the_map_bears(beam, simulator, monkeypatch):
 
 def test_options_by_name():
     nuts, length = find_sampler("nuts"), {"warmup": 5, "draws": 6, "chains": 7}
-    options = options_from(nuts, {"target_accept": 0.95, "start": "pathfinder"}, **length)
-    assert options == cal.NUTSOptions(5, 6, 7, target_accept=0.95, start="pathfinder")
+    options = options_from(nuts, {"target_accept": 0.95, "rounds": 2}, **length)
+    assert options == cal.NUTSOptions(5, 6, 7, target_accept=0.95, rounds=2)
     with pytest.raises(InputError, match="'nuts': unknown key 'leapfrogs'; known: chains, draws"):
         options_from(nuts, {"leapfrogs": 3}, **length)
     with pytest.raises(InputError, match="'nuts': rounds = \"two\"; expected a whole number"):
