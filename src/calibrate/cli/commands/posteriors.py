@@ -196,12 +196,19 @@ def _add_demos(parser: ArgumentParser) -> None:
 )
 def demo(arguments: Namespace) -> Answer:
     """Run the demo and write its report."""
-    from calibrate.project.demo import run_demo
+    from calibrate.project.demo import BEAM, PICTURE, run_demo
+    from calibrate.project.results import REPORT
 
-    start = time.perf_counter()
+    start, is_beam = time.perf_counter(), arguments.scene == BEAM.scene
+    if not is_beam:
+        check_plotly("a report")
     result = run_demo(arguments.out, arguments.scene, progress=not arguments.json)
+    if not is_beam:
+        from calibrate.report import write_report
+
+        write_report(arguments.out)
     result["seconds"] = round(time.perf_counter() - start, 1)
-    names = ("posterior.nc", "certificate.json", result.pop("picture"))
+    names = ("posterior.nc", "certificate.json", PICTURE if is_beam else REPORT)
     result["files"] = [f"{arguments.out}/{name}" for name in names]
     lines = [posterior_summary(result)]
     if "identifiability" in result:
