@@ -118,12 +118,7 @@ def blackjax_kernel(log_density: Callable[..., jax.Array], options: BlackJAXNUTS
     return Kernel(init, step)
 
 
-_STATISTICS = ("diverging", "acceptance_rate", "n_steps", "lp", "energy")
-NUTS = ChainSampler("nuts", NUTSOptions, _STATISTICS, numpyro_kernel)
-BLACKJAX_NUTS = ChainSampler(
-    "blackjax_nuts",
-    BlackJAXNUTSOptions,
-    (*_STATISTICS, "tree_depth"),
-    blackjax_kernel,
-    adapts_in_steps=False,
+NUTS: ChainSampler = ChainSampler("nuts", NUTSOptions, numpyro_kernel)
+BLACKJAX_NUTS: ChainSampler = ChainSampler(
+    "blackjax_nuts", BlackJAXNUTSOptions, blackjax_kernel, adapts_in_steps=False
 )

@@ -1,4 +1,4 @@
-"""What a sampler provides: its name, options, statistics, and draws from a density.
+"""What a sampler provides: its name, options, and draws from a density.
 
 Samplers that are Markov chains give a :class:`Kernel` and options that extend
 :class:`ChainOptions`, and leave the rest to :class:`~calibrate.samplers.chains.ChainSampler`; a
@@ -53,12 +53,10 @@ class Sampler(ABC):
 
     name : the name in the registry and on the command line.
     options : the frozen dataclass of its settings; its defaults are the sampler's.
-    statistics : the names of the statistics that come with every draw.
     """
 
     name: str
     options: type[Any]
-    statistics: tuple[str, ...]
 
     @abstractmethod
     def sample(self, density: Any, data: Any, options: Any, context: Context) -> Draws:
