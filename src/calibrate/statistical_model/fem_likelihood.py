@@ -1,6 +1,7 @@
 """FEM's log likelihood at draws of a posterior, beside the cheap map's.
 
-It serves certificates, and is the only place that solves FEM for a draw.
+It serves certificates and learned errors of a map, and is the only place that solves FEM for a
+draw.
 """
 
 from __future__ import annotations
