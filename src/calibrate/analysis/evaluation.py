@@ -65,7 +65,7 @@ def run_evaluation(
         reference = fem_reference(simulator, count, progress=progress)
     else:
         reference = published_reference(scene, against, progress=progress)
-    made_of = Ingredients(scene, simulator, emulator, seed=0, extrapolate=True, progress=progress)
+    made_of = Ingredients(scene, simulator, emulator, seed=0, progress=progress)
     map_ = build_forward(forward, made_of, forward_options)
     errors = case_errors(map_, reference.thetas, reference.displacement)
     report = {
