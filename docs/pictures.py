@@ -49,7 +49,7 @@ def beam(path: Path) -> None:
 def report(path: Path, browser: Any) -> None:
     """The body on a report of the ventricle's demo, at one of its draws."""
     with tempfile.TemporaryDirectory() as folder:
-        infer(replace(DEMOS["left_ventricle"].run, sampler="laplace"), folder)
+        infer(replace(DEMOS["left_ventricle"], sampler="laplace"), folder)
         page = opened(browser, 1152, 900)
         page.goto(write_report(folder, fem=False).resolve().as_uri())
         page.wait_for_selector(".slider-rail-touch-rect")

@@ -186,10 +186,6 @@ COMMANDS = [
     ("simulate liver --root .", "--root has no effect with scene 'liver'"),
     ("evaluate once_clamped_beam --against . --cases 3", "cases: every released one is compared"),
     (
-        "evaluate once_clamped_beam --against . --outside 0.1",
-        "outside: nothing was released outside the box",
-    ),
-    (
         "evaluate once_clamped_beam --against fem --fem-runs 9",
         "--fem-runs has no effect without --forward reduced",
     ),

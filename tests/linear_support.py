@@ -1,7 +1,6 @@
 """A forward map linear in theta, whose posterior is known in closed form."""
 
 from dataclasses import dataclass, replace
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -74,19 +73,6 @@ class Step:
 
     def evaluate(self, theta):
         return self.forward.evaluate(theta)._replace(displacement=self(theta))
-
-
-@dataclass(frozen=True, eq=False)
-class LinearFEM:
-    """Stands in for a simulator: its solutions are those of ``forward``; above ``limit`` it fails."""
-
-    scene: object
-    forward: LinearForward
-    limit: float = np.inf
-
-    def solve(self, theta, start=None):
-        converged = bool(jnp.all(theta < self.limit))
-        return SimpleNamespace(converged=converged, displacement=self.forward(theta))
 
 
 def closed_form(forward, nodes, data, sd, mean, prior_sd):

@@ -89,17 +89,11 @@ WAYS = {
     **{f"POD + GP, {n} FEM runs, NUTS": Way("POD + GP", _reduced(n)) for n in (10, 30, 60)},
     "POD + GP, 60 FEM runs, NumPyro's NUTS": Way("POD + GP", _reduced(60), by_numpyro),
     "network alone, NUTS": Way("network", _network, before_s=lambda: entries.NETWORK()[1]),
-    "series + discrepancy, 20 FEM runs, MCLMC": Way(
-        "emulator", _mechanics(20), entries.sampler("mclmc")
-    ),
     "series + discrepancy, 20 FEM runs, SMC": Way(
         "emulator", _mechanics(20), entries.sampler("smc")
     ),
     "series + discrepancy, 20 FEM runs, Laplace": Way(
         "emulator", _mechanics(20), entries.sampler("laplace")
-    ),
-    "series + discrepancy, 5 FEM runs, delayed acceptance": Way(
-        "FEM", _mechanics(5), entries.sampler("delayed_acceptance")
     ),
     "FEM, NUTS": Way("FEM", _fem, FEW),
 }

@@ -4,7 +4,7 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from studies.fem_posterior.methods import LATE, Weighed
+from studies.fem_posterior.methods import Weighed
 
 from calibrate.certificate.estimates import jackknife, moments
 from calibrate.samplers.diagnostics import effective, normalised
@@ -59,23 +59,9 @@ def of_runs(one: dict[str, Any], other: dict[str, Any], names: list[str]) -> dic
 
 
 def with_agreement(case: dict[str, Any]) -> dict[str, Any]:
-    """``case`` with every two of its runs compared, and delayed acceptance's share of the solves.
-
-    The share is of FEM solves an effective draw, against each run of NUTS with FEM: as run, of the
-    kept draws alone, and of 1000 effective draws after the same warm-up.
-    """
-    runs = case["runs"]
-    pairs = combinations(reversed(runs), 2)
-    late = next(run for run in runs if run["method"] == LATE)
-    by_fem = [run for run in runs if run["adjoints"]]
-    return {
-        **case,
-        "agreement": [of_runs(one, other, case["names"]) for one, other in pairs],
-        "share_of_solves": {
-            run["method"]: {key: cost(late)[key] / value for key, value in cost(run).items()}
-            for run in by_fem
-        },
-    }
+    """``case`` with every two of its runs compared."""
+    pairs = combinations(reversed(case["runs"]), 2)
+    return {**case, "agreement": [of_runs(one, other, case["names"]) for one, other in pairs]}
 
 
 def cost(run: dict[str, Any]) -> dict[str, float]:

@@ -14,15 +14,13 @@ import calibrate as cal
 from calibrate.posterior import Posterior
 from calibrate.samplers import density_of, named_draws, transport
 from calibrate.samplers.chains import compile_chains
-from calibrate.samplers.delayed_acceptance import DelayedAcceptanceOptions
 from calibrate.samplers.nuts import NUTS, NUTSOptions
 from calibrate.statistical_model import FEMLikelihood
 
 AXES = {"chain_axis": 0, "draw_axis": 1}
-PLAIN, TUNED, LATE, CHEAP = (
+PLAIN, TUNED, CHEAP = (
     "FEM-NUTS",
     "FEM-NUTS, tuned by the emulator",
-    "delayed acceptance",
     "emulator + certificate",
 )
 
@@ -32,17 +30,14 @@ class Sizes:
     """Lengths of the runs.
 
     chains, warmup, draws : of FEM-NUTS. tuned : warm-up and draws of the run that starts from the
-    emulator's posterior. late, late_chains : draws and chains of delayed acceptance. weighed :
-    draws of the emulator at which FEM is solved. certificate : FEM runs. cheap : warm-up and draws
-    of the emulator's own run.
+    emulator's posterior. weighed : draws of the emulator at which FEM is solved. certificate : FEM
+    runs. cheap : warm-up and draws of the emulator's own run.
     """
 
     chains: int = 2
     warmup: int = 150
     draws: int = 200
     tuned: tuple[int, int] = (100, 200)
-    late: int = 250
-    late_chains: int = 4
     weighed: int = 1000
     certificate: int = 200
     cheap: tuple[int, int] = (500, 1000)
@@ -146,28 +141,6 @@ def by_emulator(problem: Problem, sizes: Sizes, seed: int) -> tuple[Outcome, Pos
         again_s=again, more=more,
     )  # fmt: skip
     return made, posterior
-
-
-def by_late_decision(problem: Problem, sizes: Sizes, seed: int) -> Outcome:
-    """Delayed acceptance with its default options."""
-    options = DelayedAcceptanceOptions(draws=sizes.late, chains=sizes.late_chains)
-
-    def once(seed: int) -> tuple[Posterior, float]:
-        begin = time.process_time()
-        posterior = cal.sample(
-            problem.cheap, problem.data, sampler="delayed_acceptance", options=options,
-            seed=seed, predictions=False, simulator=problem.simulator,
-        )  # fmt: skip
-        return posterior, time.process_time() - begin
-
-    posterior, seconds = once(seed)
-    again = once(seed)[1]
-    statistics = posterior.tree["sample_stats"]
-    return Outcome(
-        LATE, stacked(posterior), int(posterior.tree.attrs["fem_solves"]),
-        int(statistics["fem_solves"].sum()), seconds, again_s=again,
-        more={"accepted": float(statistics["accepted"].mean())},
-    )  # fmt: skip
 
 
 def by_fem(problem: Problem, sizes: Sizes, seed: int) -> Outcome:

@@ -39,10 +39,6 @@ def tables(cases: list[dict[str, Any]]) -> str:
                 f"{run['processor_s']:.0f} | {'' if again is None else f'{again:.0f}'} | "
                 f"{run['effective_per_s']:.2g} | {'' if rate is None else f'{rate:.2g}'} |"
             )
-    for case in problems:
-        for method, share in case["share_of_solves"].items():
-            words = ", ".join(f"{key} 1/{1.0 / value:.1f}" for key, value in share.items())
-            lines.append(f"{case['name']}: delayed acceptance against {method}: {words}")
     for case in cases:
         lines += ["", *_shifts(case)] if "certificates" in case else []
     return "\n".join(lines)

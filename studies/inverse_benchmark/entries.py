@@ -71,9 +71,9 @@ def sampler(name: str, **options: Any) -> Method:
         chosen = find_sampler(name)
         posterior = cal.sample(
             statistical, data, sampler=name, options=chosen.options(**options), seed=3,
-            predictions=False, simulator=simulator() if chosen.solves_fem else None,
+            predictions=False,
         )  # fmt: skip
-        return posterior.draws(), int(posterior.tree.attrs.get("fem_solves", 0))
+        return posterior.draws(), 0
 
     return draw
 
@@ -141,11 +141,6 @@ OURS = {
     "pod_gp_nuts": Entry(
         f"POD + GP of {RUNS} runs, NUTS", reduced, sampler("nuts", **_NUTS)
     ),
-    "delayed_acceptance": Entry(
-        "emulator and FEM, delayed acceptance", EMULATOR,
-        sampler("delayed_acceptance", draws=125, rounds=1),
-    ),
-    "emulator_mclmc": Entry("emulator, MCLMC", EMULATOR, sampler("mclmc", **_NUTS)),
     "emulator_smc": Entry("emulator, SMC", EMULATOR, sampler("smc")),
     "pymc": Entry("emulator, PyMC", EMULATOR, by_pymc),
 }  # fmt: skip

@@ -288,9 +288,8 @@ def stress_band(
     direction: str = "fibre",
     *,
     stretches: Sequence[float] | np.ndarray = STRETCHES,
-    probability: float = 0.9,
 ) -> StressBand:
-    """Return the band of stresses under a stretch along ``fibre`` or ``cross-fibre``.
+    """Return the 90 % band of stresses under a stretch along ``fibre`` or ``cross-fibre``.
 
     A law without fibres has no directions; both are the same then. In a scene with regions it is
     that of a stiffness factor of the first.
@@ -309,8 +308,7 @@ def stress_band(
     thetas = posterior.thetas(state)
     rows = np.linspace(0, len(thetas) - 1, min(_STRESS_DRAWS, len(thetas))).astype(int)
     curve = jax.jit(jax.vmap(lambda t: stresses(model.forward.scene, t, axis, stretch)))
-    edge = 0.5 * (1.0 - probability)
-    quantiles = np.quantile(np.asarray(curve(thetas[rows])), [edge, 0.5, 1.0 - edge], axis=0)
+    quantiles = np.quantile(np.asarray(curve(thetas[rows])), [0.05, 0.5, 0.95], axis=0)
     return StressBand(direction, stretch, *quantiles)
 
 

@@ -42,7 +42,6 @@ from calibrate.certificate.verdict import Certificate, judge
 from calibrate.posterior import Posterior
 from calibrate.posterior.diagnosis import MAP_ERRORS
 from calibrate.posterior.posterior import make_tree
-from calibrate.samplers import SAMPLERS
 from calibrate.samplers.diagnostics import effective, normalised
 from calibrate.samplers.laplace import MISSED_AT, MISSED_BY
 from calibrate.samplers.proposals import MOST_TEMPERED, Kernels, key_from, tempered
@@ -112,13 +111,8 @@ def examine(
     ------
     InputError
         The simulator is for another scene, the number of runs is too small, or ``at_most`` is below
-        it, the sampler has solved FEM at the draws already, or the scheduler does not answer.
+        it, or the scheduler does not answer.
     """
-    sampler = posterior.tree.attrs.get("sampler")
-    if sampler in SAMPLERS and SAMPLERS[sampler].solves_fem:
-        raise InputError(
-            f"the posterior of sampler '{sampler}' is FEM's already; it needs no certificate"
-        )
     count, most = _checked_counts(draws, at_most, mesh)
     stages = Stages(show=False) if stages is None else stages
     predictive = Predictive(posterior.model, posterior.data)

@@ -97,13 +97,13 @@ def moments(x: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def jackknife(
-    figures: Callable[[np.ndarray], np.ndarray], count: int, groups: int = GROUPS
+    figures: Callable[[np.ndarray], np.ndarray], count: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return ``figures`` of all of ``count`` points, and their errors.
 
     figures : a function of the mask (count,) of the points to use.
     """
-    groups = min(groups, count)
+    groups = min(GROUPS, count)
     member = np.arange(count) % groups
     value = figures(np.ones(count, dtype=bool))
     left_out = np.array([figures(member != g) for g in range(groups)])

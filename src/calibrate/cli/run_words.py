@@ -255,7 +255,7 @@ WORDS = {
     "mesh_error_runs": Word(flag="--mesh-error"),
     "sampler_options": Word(
         "NAME=VALUE",
-        "e.g. target_accept=0.95, start=pathfinder; an unknown name lists the sampler's",
+        "e.g. target_accept=0.95, rounds=2; an unknown name lists the sampler's",
         read=sampler_options,
     ),
 }

@@ -7,12 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibrate.figures import draw_body, panels, pyplot, save, with_unit
+from calibrate.figures import draw_body, panels, pyplot, save
 from emulator.accuracy.comparison import UNITS, Errors, log_density, quantiles
 from emulator.geometry.facets import flat_triangles
 from emulator.geometry.mesh import Mesh
-from emulator.scenes.parameter_space import Parameter
-from emulator.scenes.scene import Scene
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,7 +26,7 @@ LABELS = {
     "err_V": "error in cavity volume (%)",
     "err_R": "error in force of support (N)",
 }
-_INSIDE, _OUTSIDE = "tab:blue", "tab:orange"
+_COLOUR = "tab:blue"
 
 
 def draw(evaluated: Evaluated, folder: str | Path) -> list[Path]:
@@ -36,12 +34,9 @@ def draw(evaluated: Evaluated, folder: str | Path) -> list[Path]:
     scene, folder = evaluated.forward.scene, Path(folder)
     title = f"{scene.name}: {evaluated.forward.label} against {evaluated.report['reference']}"
     figures = {
-        "error_densities.png": density_figure(evaluated.inside, evaluated.outside, title),
-        "error_over_parameters.png": parameter_figure(
-            scene, evaluated.inside, evaluated.outside, title
-        ),
+        "error_densities.png": density_figure(evaluated.errors, title),
         "error_on_surface.png": surface_figure(
-            scene.mesh, evaluated.inside.fields["err_u"].mean(axis=0), title
+            scene.mesh, evaluated.errors.fields["err_u"].mean(axis=0), title
         ),
     }
     for name, figure in figures.items():
@@ -49,14 +44,12 @@ def draw(evaluated: Evaluated, folder: str | Path) -> list[Path]:
     return [folder / name for name in figures]
 
 
-def density_figure(inside: Errors, outside: Errors | None, title: str) -> Any:
+def density_figure(errors: Errors, title: str) -> Any:
     """Return a figure of each error's density, its median and 97.5 % quantile; log axis."""
-    names = [name for name in LABELS if name in inside.fields]
+    names = [name for name in LABELS if name in errors.fields]
     figure, grid = panels(len(names), 3 if len(names) > 4 else 2, (4.2, 3.2))
     for axes, name in zip(grid.flat, names, strict=False):
-        _draw_density(axes, inside.fields[name], _INSIDE, "inside" if outside else "")
-        if outside is not None:
-            _draw_density(axes, outside.fields[name], _OUTSIDE, "outside")
+        _draw_density(axes, errors.fields[name])
         axes.set(xscale="log", xlabel=LABELS[name], ylim=(0.0, None), yticks=[])
         if axes.lines:
             axes.legend(
@@ -69,102 +62,18 @@ def density_figure(inside: Errors, outside: Errors | None, title: str) -> Any:
     return figure
 
 
-def _draw_density(axes: Axes, values: np.ndarray, colour: str, label: str) -> None:
+def _draw_density(axes: Axes, values: np.ndarray) -> None:
     marks = quantiles(values)
-    head = f"{label}: " if label else ""
     for name, style, text in (("median", "-", "median"), ("q97_5", "--", "97.5 %")):
         if marks[name] > 0.0:
-            line = f"{head}{text} {marks[name]:.3g}"
-            axes.axvline(marks[name], color=colour, ls=style, lw=1.2, label=line)
+            line = f"{text} {marks[name]:.3g}"
+            axes.axvline(marks[name], color=_COLOUR, ls=style, lw=1.2, label=line)
     curve = log_density(values)
     if curve is None:
         return  # all values are alike: no density to draw
     at, density = curve
-    axes.plot(at, density, color=colour, lw=1.5)
-    axes.fill_between(at, density, color=colour, alpha=0.2, lw=0)
-
-
-def parameter_figure(scene: Scene, inside: Errors, outside: Errors | None, title: str) -> Any:
-    """Return a figure of each case's median err_u: a map of two parameters, or panels of each."""
-    groups = [(inside, "o", "inside the box")]
-    if outside is not None:
-        groups.append((outside, "D", "outside"))
-    cases = [
-        (errors.thetas, np.maximum(np.median(errors.fields["err_u"], axis=1), 1e-17), marker, label)
-        for errors, marker, label in groups
-    ]
-    two = len(scene.parameters) == 2
-    figure = _draw_map(scene, cases) if two else _draw_panels(scene, cases)
-    figure.suptitle(title)
-    return figure
-
-
-def _draw_map(scene: Scene, cases: list[Any]) -> Any:
-    """Draw cases in the plane of two parameters, coloured by their error."""
-    from matplotlib.colors import LogNorm
-    from matplotlib.patches import Rectangle
-
-    plt = pyplot()
-    figure, axes = plt.subplots(figsize=(6.8, 5.4), layout="constrained")
-    everything = np.concatenate([errors for _, errors, _, _ in cases])
-    low, high = everything.min(), everything.max()
-    norm = LogNorm(low, max(high, 1.01 * low))
-    scatter = None
-    for thetas, errors, marker, label in cases:
-        scatter = axes.scatter(
-            *thetas.T, c=errors, norm=norm, marker=marker, s=42, ec="k", lw=0.4, label=label
-        )
-    figure.colorbar(scatter, ax=axes, label="median error in displacement of a case (mm)")
-    x, y = scene.parameters
-    size = (x.high - x.low, y.high - y.low)
-    axes.add_patch(Rectangle((x.low, y.low), *size, fill=False, ls="--", lw=1.0))
-    if len(cases) > 1:
-        figure.legend(loc="outside lower center", ncols=2, frameon=False)
-    axes.set(xlabel=with_unit(x.name, x.unit), ylabel=with_unit(y.name, y.unit))
-    _scale(axes.set_xscale, axes.xaxis, x)
-    _scale(axes.set_yscale, axes.yaxis, y)
-    return figure
-
-
-def _draw_panels(scene: Scene, cases: list[Any]) -> Any:
-    """Draw the error of the cases over each parameter in turn."""
-    figure, grid = panels(len(scene.parameters), 3, (3.8, 3.2), margin=(0.6, 0.6), sharey=True)
-    for k, (axes, parameter) in enumerate(zip(grid.flat, scene.parameters, strict=False)):
-        for (thetas, errors, marker, label), colour in zip(
-            cases, (_INSIDE, _OUTSIDE), strict=False
-        ):
-            axes.scatter(
-                thetas[:, k], errors, marker=marker, color=colour, s=22, alpha=0.75, lw=0,
-                label=label,
-            )  # fmt: skip
-        axes.axvspan(parameter.low, parameter.high, color="0.93", zorder=0)
-        axes.set(xlabel=with_unit(parameter.name, parameter.unit), yscale="log")
-        _scale(axes.set_xscale, axes.xaxis, parameter)
-    _plain(grid[0, 0].yaxis, (1.0, 2.0, 5.0))  # shared
-    for axes in grid[:, 0]:
-        axes.set_ylabel("median err_u of a case (mm)")
-    if len(cases) > 1:
-        figure.legend(
-            *grid[0, 0].get_legend_handles_labels(),
-            loc="outside lower center", ncols=2, frameon=False,
-        )  # fmt: skip
-    return figure
-
-
-def _scale(set_scale: Any, axis: Any, parameter: Parameter) -> None:
-    """Set the parameter's own scale, with plain numbers at its ticks."""
-    if parameter.scale == "log":
-        set_scale("log")
-        _plain(axis, (1.0, 2.0, 3.0, 5.0, 7.0))
-
-
-def _plain(axis: Any, digits: tuple[float, ...]) -> None:
-    """Set ticks of a logarithmic axis at these leading digits, as plain numbers."""
-    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
-
-    axis.set_major_locator(LogLocator(subs=digits))
-    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axis.set_minor_formatter(NullFormatter())
+    axes.plot(at, density, color=_COLOUR, lw=1.5)
+    axes.fill_between(at, density, color=_COLOUR, alpha=0.2, lw=0)
 
 
 def surface_figure(

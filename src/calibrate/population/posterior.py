@@ -131,13 +131,13 @@ class Hierarchy(TableRepr):
         data = predictions.replicates(model, draws, data_key)
         return {name: values.reshape(-1, *values.shape[2:]) for name, values in data.items()}
 
-    def as_prior(self, source: str = "") -> Population:
+    def as_prior(self) -> Population:
         """Return the population as a prior: log-normals fitted to :meth:`new_member`.
 
         The uncertainty of the population widens it. A parameter with values of 0 or less is
         refused.
         """
-        source = source or f"a hierarchy of {len(self.members)} members"
+        source = f"a hierarchy of {len(self.members)} members"
         return population_of_fits({n: v.tolist() for n, v in self.new_member().items()}, source)
 
     def shrinkage(self) -> dict[str, dict[str, Shrinkage]]:

@@ -42,7 +42,6 @@ LARGEST_DIVERGENT = 0.002
 MAP_FIRST = "mend the map first"  # the remedy of chains on a wrong map
 _FEWEST = 200  # replicates from which a small p, or a share of the prior's sd, can be estimated
 _LOWEST_EFFICIENCY = 0.2
-_LOWEST_ACCEPTANCE = 0.1
 _MANY = 100.0
 _MARKED = 0.5  # standard deviations from which a shift of divergences is reported
 # A posterior counts as the prior if its least sd over the prior's is above the first number, and
@@ -189,11 +188,6 @@ def diagnose(
         yield (
             f"{sizes[name]:.0f} effective draws of {name}, fewer than {limits.ENOUGH_ESS:.0f}: "
             f"quantiles are uncertain; {'take more draws' if wrong_map is None else MAP_FIRST}"
-        )
-    if (rate := float(np.mean(statistics.get("accepted", 1.0)))) < _LOWEST_ACCEPTANCE:
-        yield (
-            f"FEM took {100.0 * rate:.2g} % of the proposals only: the forward map is far from FEM "
-            "here; train it longer, or use forward map 'corrected'"
         )
     k, efficiency = attributes.get("pareto_k", 0.0), attributes.get("importance_efficiency", 1.0)
     if not (k <= limits.LARGEST_PARETO_SHAPE and efficiency >= _LOWEST_EFFICIENCY):

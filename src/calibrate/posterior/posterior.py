@@ -26,12 +26,11 @@ from calibrate.samplers.checkpoint import Checkpoint, identity_of
 from calibrate.samplers.laplace import MISSED_BY, find_modes, missed_mode
 from calibrate.samplers.protocol import Context
 from calibrate.state_names import split
-from calibrate.statistical_model import Data, FEMLikelihood, Model
+from calibrate.statistical_model import Data, Model
 from emulator.core.display import TableRepr
 from emulator.core.errors import InputError, check_known
 from emulator.core.machine import one_blas_thread
 from emulator.core.store import write_netcdf
-from emulator.fem import Simulator
 
 # Keep the keys of replicated data and of the search for modes apart from the sampler's.
 _PREDICTIONS, _MODES = 0x9E3779B9, 0x85EBCA6B
@@ -212,7 +211,6 @@ def sample(
     seed: int = 0,
     progress: bool = False,
     predictions: bool = True,
-    simulator: Simulator | None = None,
     checkpoint: str | Path | None = None,
 ) -> Posterior:
     """Draw from the posterior of ``model`` given ``data``.
@@ -227,7 +225,6 @@ def sample(
     Parameters
     ----------
     predictions : whether the DataTree gets log likelihoods and replicated data.
-    simulator : FEM, for samplers that solve it in a second stage.
     checkpoint : a file that the run's state is kept in every few seconds. If the run is killed, the
         same call goes on from there to the same draws; the file is removed when they are complete.
 
@@ -235,18 +232,11 @@ def sample(
     ------
     InputError
         Unknown sampler, options of another sampler, data of the wrong shape, with infinite values
-        or of which all values are missing, a sampler that needs a simulator and has none, a
-        checkpoint of another run.
+        or of which all values are missing, a checkpoint of another run.
     """
     method = find_sampler(sampler, options)
     options = check_options(method, options)
     model, checked = model.given(data)
-    if simulator is None and method.solves_fem:
-        raise InputError(
-            f"sampler '{method.name}' solves FEM in its second stage: give simulator=..., of the "
-            "posterior's scene"
-        )
-    fem = None if simulator is None else FEMLikelihood(model, simulator)
     record = provenance(model, seed, method.name, options)
     # The scene's place is no matter. Messages name the first difference, so what a user changes
     # most comes first.
@@ -254,7 +244,7 @@ def sample(
     matters = first | {name: value for name, value in record.items() if name != "scene"}
     state = Checkpoint(checkpoint, identity_of(matters, checked))
     density = density_of(model)
-    run = method.sample(density, checked, options, Context(seed, progress, state, fem))
+    run = method.sample(density, checked, options, Context(seed, progress, state))
     attributes = dict(run.attributes)
     if MISSED_BY not in attributes:
         z = np.asarray(run.z).reshape(-1, density.dimension)
@@ -263,7 +253,7 @@ def sample(
         attributes |= missed_mode(density, checked, z, modes)
     rng_key = jax.random.fold_in(jax.random.key(seed), _PREDICTIONS) if predictions else None
     draws = named_draws(model, run.z)
-    tree = make_tree(model, checked, draws, run.statistics, rng_key, run.means)
+    tree = make_tree(model, checked, draws, run.statistics, rng_key)
     tree.attrs.update(as_attributes(record | attributes))
     state.remove()
     return Posterior(tree, model, checked)

@@ -31,7 +31,6 @@ from emulator.core.store import write_json
 from emulator.surrogates.fem import FEMForward
 
 NOT_CERTIFIED = "not certified"
-DECIDED_BY_FEM = "decided by FEM"
 SECONDS = "seconds"  # attribute of a posterior: the seconds of each stage, as JSON
 
 
@@ -80,11 +79,10 @@ def infer(
                 options=options,
                 seed=problem.run.seed,
                 progress=progress,
-                simulator=problem.simulator if sampler.solves_fem else None,
                 checkpoint=None if target is None else target / SAMPLING,
             )
         errors = {}
-        if check_map and not (sampler.solves_fem or isinstance(model.full, FEMForward)):
+        if check_map and not isinstance(model.full, FEMForward):
             with stages("check of the map"):
                 errors = map_errors(posterior.model, problem.simulator, posterior.draws())
         attributes = {
@@ -153,9 +151,6 @@ def report(run: Run, posterior: Posterior, certificate: Certificate | None) -> d
         "warnings": posterior.warnings(),
         "seconds": json.loads(posterior.tree.attrs.get(SECONDS, "{}")),
     }
-    if "fem_solves" in posterior.tree.attrs:
-        result["fem_solves"] = int(posterior.tree.attrs["fem_solves"])
-        result["verdict"] = DECIDED_BY_FEM
     if "log_evidence" in posterior.tree.attrs:
         result["log_evidence"] = posterior.tree.attrs["log_evidence"]
         result["log_evidence_error"] = posterior.tree.attrs.get("log_evidence_error")

@@ -19,7 +19,7 @@ from calibrate.population import Hierarchy, population_model, read_hierarchy, sa
 from calibrate.population.sample import TARGET_ACCEPT
 from calibrate.posterior import Posterior
 from calibrate.priors import log_normal
-from calibrate.project.calibration import DECIDED_BY_FEM, NOT_CERTIFIED, certify_and_keep, infer
+from calibrate.project.calibration import NOT_CERTIFIED, certify_and_keep, infer
 from calibrate.project.problem import Problem, read_problem, with_data
 from calibrate.project.results import (
     CERTIFICATE,
@@ -34,7 +34,6 @@ from calibrate.project.results import (
     reserved,
 )
 from calibrate.project.run import Run
-from calibrate.samplers import find_sampler
 from calibrate.samplers.importance import AUTO
 from calibrate.samplers.nuts import NUTS
 from calibrate.statistical_model import Model
@@ -137,7 +136,7 @@ def infer_members(
             posteriors[name] = _posterior_of(plan.problem(name), own, force, progress)
             if certify:
                 verdicts[name] = (
-                    _written_verdict(run, own)
+                    _written_verdict(own)
                     or certify_and_keep(
                         posteriors[name], own, load_steps=run.load_steps, progress=progress
                     ).verdict
@@ -185,8 +184,8 @@ def verdicts_in(plan: Members, folder: str | Path) -> dict[str, str]:
     """Return FEM's verdicts on members in ``folder``, by name; some may have no certificate."""
     return {
         name: verdict
-        for name, run in plan.members.items()
-        if (verdict := _written_verdict(run, Path(folder) / MEMBERS / name)) is not None
+        for name in plan.members
+        if (verdict := _written_verdict(Path(folder) / MEMBERS / name)) is not None
     }
 
 
@@ -203,9 +202,7 @@ def _posterior_of(problem: Problem, folder: Path, force: bool, progress: bool) -
     return infer(problem, folder, force=force, progress=progress)
 
 
-def _written_verdict(run: Run, folder: Path) -> str | None:
-    if find_sampler(run.sampler).solves_fem:
-        return DECIDED_BY_FEM
+def _written_verdict(folder: Path) -> str | None:
     path = folder / CERTIFICATE
     return str(read_json(path)["verdict"]) if path.exists() else None
 

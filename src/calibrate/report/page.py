@@ -100,8 +100,6 @@ def _verdict(
     if certificate is not None:
         text, findings = certificate["verdict"], certificate["findings"]
         basis = " ".join([*_basis(certificate), basis, day])
-    elif "fem_solves" in posterior.tree.attrs:
-        text = "decided by FEM"
     else:
         text = "not certified"
         findings = ["no certificate yet: run calibrate certify on this folder"]

@@ -25,9 +25,7 @@ GOOD, UNSURE, BAD = "#00684a", "#8a5a00", "#9c2a00"
 SUMMARY = ("mean", "sd", "5 %", "95 %", "R-hat", "ESS bulk", "ESS tail")
 """Titles of :func:`summary_cells`."""
 
-_COLOURS = {
-    "accepted": GOOD, "decided by FEM": GOOD, "reweight": UNSURE, "undecided": UNSURE,
-}  # fmt: skip
+_COLOURS = {"accepted": GOOD, "reweight": UNSURE, "undecided": UNSURE}
 
 
 class Verdict(NamedTuple):

@@ -5,21 +5,17 @@ from dataclasses import fields
 from typing import Any
 
 from calibrate.samplers.chains import ChainSampler
-from calibrate.samplers.delayed_acceptance import DELAYED_ACCEPTANCE, DelayedAcceptanceOptions
 from calibrate.samplers.density import Density, density_of, named_draws
 from calibrate.samplers.diagnostics import r_hat
 from calibrate.samplers.importance import AUTO, IMPORTANCE, AutoOptions, ImportanceOptions
 from calibrate.samplers.laplace import LAPLACE, LaplaceOptions
-from calibrate.samplers.mclmc import MCLMC, MCLMCOptions
 from calibrate.samplers.nuts import BLACKJAX_NUTS, NUTS, BlackJAXNUTSOptions, NUTSOptions
 from calibrate.samplers.protocol import ChainOptions, Context, Draws, Kernel, Sampler
 from calibrate.samplers.smc import SMC, SMCOptions
 from emulator.core.errors import InputError, look_up
 from emulator.core.schema import Source, parse, table_of
 
-_ALL: tuple[Sampler, ...] = (
-    AUTO, IMPORTANCE, NUTS, BLACKJAX_NUTS, MCLMC, DELAYED_ACCEPTANCE, SMC, LAPLACE,
-)  # fmt: skip
+_ALL: tuple[Sampler, ...] = (AUTO, IMPORTANCE, NUTS, BLACKJAX_NUTS, SMC, LAPLACE)
 SAMPLERS: dict[str, Sampler] = {sampler.name: sampler for sampler in _ALL}
 
 __all__ = [
@@ -29,13 +25,11 @@ __all__ = [
     "ChainOptions",
     "ChainSampler",
     "Context",
-    "DelayedAcceptanceOptions",
     "Density",
     "Draws",
     "ImportanceOptions",
     "Kernel",
     "LaplaceOptions",
-    "MCLMCOptions",
     "NUTSOptions",
     "SMCOptions",
     "Sampler",

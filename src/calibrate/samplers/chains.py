@@ -8,11 +8,7 @@ That program is one chain's, and as many chains run at once as there are cores. 
 transition of all chains would take as many gradients as the longest trajectory among them
 (docs/experiments.md, "NUTS chains one after the other", "Chains on threads").
 
-Chains start at random points, or by multi-path Pathfinder (Zhang et al. 2022), BlackJAX's:
-quasi-Newton paths lead up the density from several points, the best Gaussian on each path is
-sampled, and one of all samples is drawn with probability proportional to posterior over Gaussian.
-Chains then start in the posterior's bulk, and in its modes about as often as their masses ask,
-where a random start may be far out or have density zero.
+Chains start at random points, within two units of the centre.
 """
 
 from __future__ import annotations
@@ -28,15 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibrate.samplers.density import Target
-from calibrate.samplers.protocol import (
-    PATHFINDER,
-    ChainOptions,
-    Context,
-    Draws,
-    Kernel,
-    Sampler,
-    in_rounds,
-)
+from calibrate.samplers.protocol import ChainOptions, Context, Draws, Kernel, Sampler, in_rounds
 from calibrate.samplers.transport import (
     StandardMap,
     apply_standard,
@@ -51,10 +39,6 @@ _CHUNK = 50  # iterations between two updates of the progress bar
 _CANDIDATES = 16  # starting points tried, for forward maps that are not valid everywhere
 _PILOT, _FINAL = 0, 1  # runs
 _PILOT_DRAWS = 1000  # draws of all chains to which a map is fitted; large maps take more
-_PATHS = 4  # Pathfinder's paths of a chain
-_SAMPLES = 20  # samples of a path's Gaussian
-_ITERATIONS = 30
-_MEMORY = 6  # pairs of steps and gradients that make a Gaussian's covariance
 
 States = tuple[Any, ...]
 """The state of each chain's kernel."""
@@ -156,15 +140,7 @@ def compile_chains(sampler: ChainSampler, density: Target, options: ChainOptions
         candidates_key, kernel_key = jax.random.split(key)
         shape = (_CANDIDATES, density.dimension)
         candidates = jax.random.uniform(candidates_key, shape, float, -2.0, 2.0)
-
-        def height(w: jax.Array) -> jax.Array:
-            return log_density(w, data, map_)
-
-        heights = jax.lax.map(height, candidates)
-        if options.start == PATHFINDER:
-            path_key = jax.random.fold_in(candidates_key, 1)
-            w = pathfinder_start(path_key, height, candidates, heights)
-            return kernel.init(kernel_key, w, data, map_), height(w)
+        heights = jax.lax.map(lambda w: log_density(w, data, map_), candidates)
         first = jnp.argmax(jnp.isfinite(heights))
         return kernel.init(kernel_key, candidates[first], data, map_), heights[first]
 
@@ -176,38 +152,6 @@ def compile_chains(sampler: ChainSampler, density: Target, options: ChainOptions
         return jax.lax.scan(step, state, length=count)
 
     return Programs(start, advance, density.at_once)
-
-
-def pathfinder_start(
-    rng_key: jax.Array,
-    log_density: Callable[[jax.Array], jax.Array],
-    candidates: jax.Array,
-    heights: jax.Array,
-) -> jax.Array:
-    """Return a starting point (p,) by Pathfinder, a candidate where all its samples have density 0.
-
-    Parameters
-    ----------
-    candidates, heights : points (c, p), c of 4 or more, and their log densities (c,). Paths begin
-        at the first ones with a finite density.
-    """
-    from blackjax.vi.multipathfinder import multi_approximate  # only this start needs the import
-
-    path_key, choice_key = jax.random.split(rng_key)
-    finite_first = jnp.argsort(~jnp.isfinite(heights), stable=True)
-    paths, _ = multi_approximate(
-        path_key,
-        log_density,
-        candidates[finite_first[:_PATHS]],
-        _SAMPLES,
-        maxiter=_ITERATIONS,
-        maxcor=_MEMORY,
-    )
-    samples = paths.samples.reshape(-1, candidates.shape[1])
-    log_ratios = (paths.logp - paths.logq).ravel()
-    usable = jnp.isfinite(log_ratios) & jnp.isfinite(paths.logp.ravel())
-    chosen = jax.random.categorical(choice_key, jnp.where(usable, log_ratios, -jnp.inf))
-    return jnp.where(jnp.any(usable), samples[chosen], candidates[finite_first[0]])
 
 
 class _State(NamedTuple):

@@ -8,7 +8,7 @@ is an argument, so that programs compiled for one data set serve others of its s
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -170,18 +170,6 @@ def without_nan(log_density: jax.Array) -> jax.Array:
 def finite_coordinates(z: jax.Array) -> np.ndarray:
     """Return ``z`` with finite coordinates; a draw on a bound is at infinity."""
     return np.clip(np.nan_to_num(np.asarray(z), posinf=1e9, neginf=-1e9), -_FARTHEST, _FARTHEST)
-
-
-@lru_cache(maxsize=4)
-def tempered(density: Density, power: float) -> Density:
-    """Return ``density`` with its likelihood to a power in (0, 1]: wider for a power below 1."""
-    if power == 1.0:
-        return density
-
-    def log_density(z: jax.Array, data: Data) -> jax.Array:
-        return density.log_prior(z) + power * density.log_likelihood(z, data)
-
-    return replace(density, log_density=log_density)
 
 
 def named_draws(model: Model, z: np.ndarray) -> dict[str, np.ndarray]:

@@ -270,7 +270,7 @@ class ImportanceSampling(Sampler):
         return draws._replace(attributes=attributes)
 
 
-IMPORTANCE = ImportanceSampling("importance", ImportanceOptions, ("lp",))
+IMPORTANCE: Sampler = ImportanceSampling("importance", ImportanceOptions)
 
 MOST_UNKNOWNS = 8
 # Attributes of a run of ``auto``: whose draws they are, and why not those of importance sampling.
@@ -330,4 +330,4 @@ def _for(sampler: Sampler, options: AutoOptions) -> Any:
     return sampler.options(**{name: getattr(options, name) for name in names})
 
 
-AUTO = Auto("auto", AutoOptions, ("lp",))
+AUTO: Sampler = Auto("auto", AutoOptions)

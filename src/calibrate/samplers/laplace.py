@@ -145,7 +145,7 @@ class Laplace(Sampler):
         return Draws(z.reshape(*shape, -1), statistics, attributes)
 
 
-LAPLACE = Laplace("laplace", LaplaceOptions, ("lp", "log_ratio"))
+LAPLACE: Sampler = Laplace("laplace", LaplaceOptions)
 
 
 def _draw(

@@ -3,21 +3,20 @@
 Which of the two is faster depends on the posterior: BlackJAX's on landmarks and strains, NumPyro's
 on a volume (studies/decoder_speed). NumPyro's kernel adapts step size and metric in its first steps
 and is compiled once a model, where its ``MCMC`` class compiles for every run. BlackJAX's runs
-Stan's window adaptation in ``init``, after which its transitions are reversible, as delayed
-acceptance needs them.
+Stan's window adaptation in ``init``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 from numpyro.infer.hmc import hmc
 
 from calibrate.samplers.chains import ChainSampler
-from calibrate.samplers.protocol import ChainOptions, Kernel, Statistics, TunedState, tuned_step
+from calibrate.samplers.protocol import ChainOptions, Kernel, Statistics
 
 
 @dataclass(frozen=True)
@@ -38,6 +37,15 @@ class BlackJAXNUTSOptions(NUTSOptions):
     """Length of a run."""
 
     label: ClassVar[str] = "BlackJAX NUTS"
+
+
+class _TunedState(NamedTuple):
+    """State of BlackJAX's chain: random key, position and its density, what was adapted."""
+
+    rng_key: jax.Array
+    state: Any
+    step_size: jax.Array
+    inverse_mass_matrix: jax.Array
 
 
 def numpyro_kernel(log_density: Callable[..., jax.Array], options: NUTSOptions) -> Kernel:
@@ -77,7 +85,9 @@ def blackjax_kernel(log_density: Callable[..., jax.Array], options: BlackJAXNUTS
     import blackjax  # only some samplers need this import
     from blackjax.adaptation.base import get_filter_adapt_info_fn
 
-    def init(rng_key: jax.Array, position: jax.Array, *arguments: Any) -> TunedState:
+    transition = blackjax.nuts.build_kernel()
+
+    def init(rng_key: jax.Array, position: jax.Array, *arguments: Any) -> _TunedState:
         adaptation_key, next_key = jax.random.split(rng_key)
         adaptation = blackjax.window_adaptation(
             blackjax.nuts,
@@ -87,18 +97,28 @@ def blackjax_kernel(log_density: Callable[..., jax.Array], options: BlackJAXNUTS
             adaptation_info_fn=get_filter_adapt_info_fn(),
         )
         (state, tuned), _ = adaptation.run(adaptation_key, position, options.warmup)
-        return TunedState(next_key, state, tuned["step_size"], tuned["inverse_mass_matrix"])
+        return _TunedState(next_key, state, tuned["step_size"], tuned["inverse_mass_matrix"])
 
-    more = {"energy": "energy", "tree_depth": "num_trajectory_expansions"}
-    return Kernel(init, tuned_step(log_density, blackjax.nuts.build_kernel(), more))
+    def step(state: _TunedState, *arguments: Any) -> tuple[_TunedState, jax.Array, Statistics]:
+        transition_key, next_key = jax.random.split(state.rng_key)
+        inner, info = transition(
+            transition_key, state.state, lambda zeta: log_density(zeta, *arguments),
+            step_size=state.step_size, inverse_mass_matrix=state.inverse_mass_matrix,
+        )  # fmt: skip
+        statistics = {
+            "diverging": info.is_divergent,
+            "acceptance_rate": info.acceptance_rate,
+            "n_steps": info.num_integration_steps,
+            "lp": inner.logdensity,
+            "energy": info.energy,
+            "tree_depth": info.num_trajectory_expansions,
+        }
+        return state._replace(rng_key=next_key, state=inner), inner.position, statistics
+
+    return Kernel(init, step)
 
 
-_STATISTICS = ("diverging", "acceptance_rate", "n_steps", "lp", "energy")
-NUTS = ChainSampler("nuts", NUTSOptions, _STATISTICS, numpyro_kernel)
-BLACKJAX_NUTS = ChainSampler(
-    "blackjax_nuts",
-    BlackJAXNUTSOptions,
-    (*_STATISTICS, "tree_depth"),
-    blackjax_kernel,
-    adapts_in_steps=False,
+NUTS: ChainSampler = ChainSampler("nuts", NUTSOptions, numpyro_kernel)
+BLACKJAX_NUTS: ChainSampler = ChainSampler(
+    "blackjax_nuts", BlackJAXNUTSOptions, blackjax_kernel, adapts_in_steps=False
 )

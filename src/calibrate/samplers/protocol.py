@@ -1,4 +1,4 @@
-"""What a sampler provides: its name, options, statistics, and draws from a density.
+"""What a sampler provides: its name, options, and draws from a density.
 
 Samplers that are Markov chains give a :class:`Kernel` and options that extend
 :class:`ChainOptions`, and leave the rest to :class:`~calibrate.samplers.chains.ChainSampler`; a
@@ -17,10 +17,7 @@ import jax
 
 from calibrate.samplers.checkpoint import Checkpoint
 from calibrate.samplers.diagnostics import ENOUGH_ESS, RUN_UNTIL_R_HAT, converged
-from calibrate.statistical_model import FEMLikelihood
 from emulator.core.errors import InputError
-
-RANDOM, PATHFINDER = "random", "pathfinder"
 
 Statistics = Mapping[str, Any]
 """Statistics by ArviZ's names: ``diverging``, ``acceptance_rate``, ``n_steps``, ``lp``, ..."""
@@ -30,14 +27,11 @@ class Draws(NamedTuple):
     """Draws ``z`` (chains, draws, p) in unconstrained coordinates; statistics (chains, draws).
 
     attributes : facts of the whole run, plain JSON, e.g. ``log_evidence``.
-    means : data without noise at the draws, (chains, draws, *shape) by the observation's name, from
-        a sampler that draws from FEM's posterior in place of the model's own.
     """
 
     z: Any
     statistics: Statistics
     attributes: Mapping[str, Any] = {}
-    means: Mapping[str, Any] | None = None
 
 
 class Context(NamedTuple):
@@ -46,13 +40,11 @@ class Context(NamedTuple):
     seed : the seed of all random numbers.
     progress : whether a progress bar is shown.
     checkpoint : the file that the run's state is written to, and restored from after a kill.
-    fem : FEM's log likelihood, for samplers with FEM in a second stage.
     """
 
     seed: int = 0
     progress: bool = False
     checkpoint: Checkpoint = Checkpoint()
-    fem: FEMLikelihood | None = None
 
 
 @dataclass(frozen=True)
@@ -61,15 +53,10 @@ class Sampler(ABC):
 
     name : the name in the registry and on the command line.
     options : the frozen dataclass of its settings; its defaults are the sampler's.
-    statistics : the names of the statistics that come with every draw.
     """
 
     name: str
     options: type[Any]
-    statistics: tuple[str, ...]
-
-    solves_fem: ClassVar[bool] = False
-    """Whether the sampler needs FEM's likelihood (:attr:`Context.fem`)."""
 
     @abstractmethod
     def sample(self, density: Any, data: Any, options: Any, context: Context) -> Draws:
@@ -104,41 +91,6 @@ class Kernel(NamedTuple):
     step: Callable[..., tuple[Any, jax.Array, Statistics]]
 
 
-class TunedState(NamedTuple):
-    """State of a kernel whose ``init`` adapts: random key, BlackJAX's state, fixed parameters."""
-
-    rng_key: jax.Array
-    state: Any
-    step_size: jax.Array
-    inverse_mass_matrix: jax.Array
-
-
-def tuned_step(
-    log_density: Callable[..., jax.Array],
-    transition: Callable[..., Any],
-    statistics: Mapping[str, str] = {},
-    **options: Any,
-) -> Callable[..., tuple[TunedState, jax.Array, Statistics]]:
-    """Return the ``step`` of a :class:`Kernel` by BlackJAX's ``transition``.
-
-    statistics : further statistics, with the name of each in BlackJAX's information.
-    """
-    names = {"diverging": "is_divergent", "acceptance_rate": "acceptance_rate"}
-    names |= {"n_steps": "num_integration_steps", **statistics}
-
-    def step(state: TunedState, *arguments: Any) -> tuple[TunedState, jax.Array, Statistics]:
-        transition_key, next_key = jax.random.split(state.rng_key)
-        inner, info = transition(
-            transition_key, state.state, lambda zeta: log_density(zeta, *arguments),
-            step_size=state.step_size, inverse_mass_matrix=state.inverse_mass_matrix, **options,
-        )  # fmt: skip
-        values = {name: getattr(info, theirs) for name, theirs in names.items()}
-        values["lp"] = inner.logdensity
-        return state._replace(rng_key=next_key, state=inner), inner.position, values
-
-    return step
-
-
 @dataclass(frozen=True)
 class Options:
     """Settings of a sampler: whole numbers of 1 or more, and ``shares`` in (0, 1)."""
@@ -168,8 +120,6 @@ class ChainOptions(Options):
     chains : the number of independent chains.
     rounds : the largest number of rounds; another one begins while R-hat or ESS miss their limits.
     r_hat, ess : the largest R-hat, and smallest bulk and tail ESS of any parameter, to stop at.
-    start : where chains start: ``random``, within two units of the centre, or ``pathfinder``
-        (:func:`calibrate.samplers.chains.pathfinder_start`).
     """
 
     warmup: int = 500
@@ -178,13 +128,5 @@ class ChainOptions(Options):
     rounds: int = 8
     r_hat: float = RUN_UNTIL_R_HAT
     ess: float = ENOUGH_ESS
-    start: str = RANDOM
 
     label: ClassVar[str] = "chains"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.start not in (RANDOM, PATHFINDER):
-            raise InputError(
-                f"{self.label}: start is '{self.start}'; it is {RANDOM} or {PATHFINDER}"
-            )

@@ -239,4 +239,4 @@ def _increment(heights: jax.Array, remaining: jax.Array, survivors: float) -> ja
     return solver.dichotomy(surplus, 0.0, remaining)
 
 
-SMC = TemperedSMC("smc", SMCOptions, ("acceptance_rate", "lp"))
+SMC: Sampler = TemperedSMC("smc", SMCOptions)

@@ -1,7 +1,7 @@
 """FEM's log likelihood at draws of a posterior, beside the cheap map's.
 
-It serves all that compares a posterior with FEM: certificates, and samplers with FEM in a second
-stage. It is the only place that solves FEM for a draw.
+It serves certificates and learned errors of a map, and is the only place that solves FEM for a
+draw.
 """
 
 from __future__ import annotations

@@ -216,9 +216,9 @@ class System:
         scale = size + jnp.linalg.norm(external)
         return Balance(residual, size, norm / jnp.where(scale > 0.0, scale, 1.0))
 
-    def relative_residual(self, u: jax.Array, theta: jax.Array, load: Number = 1.0) -> jax.Array:
+    def relative_residual(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the norm of the residual relative to the internal and external forces, ()."""
-        return self.balance(u, theta, load).relative
+        return self.balance(u, theta).relative
 
     def admissible_balance(
         self, u: jax.Array, theta: jax.Array, load: jax.Array
@@ -254,9 +254,9 @@ class System:
         stress, moduli = at_points(law, law_gradients(scene, u), scene.block_tissue_at(theta))
         return block_derivatives(scene, u, stress, moduli)[1]
 
-    def tangent(self, u: jax.Array, theta: jax.Array, load: Number = 1.0) -> jax.Array:
+    def tangent(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the nonzeros (nnz,) of the tangent over the free degrees of freedom, mN/mm."""
-        return self.assemble(self.bulk(u, theta), u, theta, load, load)
+        return self.assemble(self.bulk(u, theta), u, theta, 1.0, 1.0)
 
     def assemble(
         self, bulk: jax.Array, u: jax.Array, theta: jax.Array, load_stiffness: Number, load: Number

@@ -272,7 +272,7 @@ def load(name: str | Path, scene: Scene | None = None) -> Emulator:
 
 def _build(ingredients: Ingredients, _: Options) -> ForwardMap:
     name = ingredients.scene.name if ingredients.emulator is None else ingredients.emulator
-    return ingredients.ranged(load(name, ingredients.scene).cache())
+    return load(name, ingredients.scene).cache()
 
 
 EMULATOR = ForwardKind(

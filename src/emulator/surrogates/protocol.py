@@ -88,31 +88,6 @@ def inside_only(forward: ForwardMap, theta: jax.Array) -> Prediction:
     return Prediction(forward(safe), inside)
 
 
-class Extrapolated:
-    """The map ``base`` without the limits of its box: valid wherever its displacement is finite.
-
-    It measures how the error grows outside the box; a density must not use it.
-    """
-
-    def __init__(self, base: ForwardMap) -> None:
-        self.base, self.kind, self.label = base, base.kind, base.label
-        self.scene, self.nodes = base.scene, base.nodes
-        self.fingerprint = fingerprint_of("extrapolated", base.fingerprint)
-
-    def __call__(self, theta: jax.Array) -> jax.Array:
-        """Return the displacement (k, 3) mm."""
-        return self.base(theta)
-
-    def evaluate(self, theta: jax.Array) -> Prediction:
-        """Return the displacement (k, 3) mm, and whether it is finite."""
-        u = self.base(theta)
-        return Prediction(u, jnp.all(jnp.isfinite(u)))
-
-    def at(self, nodes: np.ndarray) -> Extrapolated:
-        """Return the extrapolated map restricted to ``nodes``."""
-        return Extrapolated(self.base.at(nodes))
-
-
 def rows_of(forward: ForwardMap, nodes: np.ndarray) -> np.ndarray:
     """Return the rows of ``forward`` that belong to ``nodes``; refuse a node that it lacks."""
     nodes = check_nodes(forward.scene, nodes)
@@ -164,7 +139,6 @@ class Ingredients:
     scene, simulator : the scene and its FEM simulator.
     emulator : a shipped name or a folder; ``None`` for the emulator shipped for the scene.
     seed : the seed of the design of FEM runs.
-    extrapolate : whether the map also answers outside the box, to measure its error there.
     progress : whether progress bars are shown.
     """
 
@@ -172,12 +146,7 @@ class Ingredients:
     simulator: Simulator
     emulator: str | None = None
     seed: int = 0
-    extrapolate: bool = False
     progress: bool = False
-
-    def ranged(self, forward: ForwardMap) -> ForwardMap:
-        """Return ``forward``, extrapolated beyond the box if that is asked for."""
-        return Extrapolated(forward) if self.extrapolate else forward
 
 
 @dataclass(frozen=True)

@@ -48,13 +48,11 @@ class BatchPlan(NetworkPlan):
     objective : what is minimised (:mod:`~emulator.training.objectives`).
     simulations : the number of FEM runs.
     batch : the number of theta a step.
-    energy_weight : the weight of the energy gap in ``both``.
     """
 
     objective: Objective = "both"
     simulations: int = 256
     batch: int = 16
-    energy_weight: float = 0.3
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -137,7 +135,7 @@ def batch_training(
     assert network is not None, "an emulator in training has a network"
     predict = predictor(emulator)
     scales = loss_scales(scene, runs, from_runs=plan.learns_from_runs)
-    loss = make_loss(scene, plan.objective, scales, plan.energy_weight)
+    loss = make_loss(scene, plan.objective, scales)
 
     def draw(number: jax.Array) -> Runs:
         """Return the batch of a step, which follows from its number."""

@@ -32,6 +32,7 @@ from emulator.scenes.scene import Scene
 Objective = Literal["energy", "simulations", "gradients", "both"]
 OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
 
+ENERGY_WEIGHT = 0.3  # gamma of the objective "both"
 # Standard deviation of the displacements, as a fraction of the centre's, where no FEM run shows it.
 _GUESSED_SD = 0.2
 
@@ -48,12 +49,9 @@ class Scales(NamedTuple):
 
 
 def make_loss(
-    scene: Scene, objective: Objective, scales: Scales, weight: float
+    scene: Scene, objective: Objective, scales: Scales
 ) -> Callable[[jax.Array, Runs], jax.Array]:
-    """Return ``loss(u, batch)`` of predicted displacements ``u`` (b, n, 3) mm, by FEM's in a batch.
-
-    weight : the factor gamma of the objective ``both``.
-    """
+    """Return ``loss(u, batch)`` of predictions ``u`` (b, n, 3) mm, by FEM's in a batch."""
     Pi = jax.vmap(potential_energy(scene, Barriers()))
 
     def energy(u: jax.Array, batch: Runs) -> jax.Array:
@@ -69,7 +67,7 @@ def make_loss(
 
     def both(u: jax.Array, batch: Runs) -> jax.Array:
         gap = (Pi(u, batch.theta) - batch.energy) / jnp.abs(batch.energy)
-        return simulations(u, batch) + weight * jnp.mean(gap)
+        return simulations(u, batch) + ENERGY_WEIGHT * jnp.mean(gap)
 
     losses = (energy, simulations, gradients, both)
     return dict(zip(OBJECTIVES, losses, strict=True))[objective]

@@ -23,7 +23,7 @@ from emulator.scenes import Scene
 from emulator.scenes.scene import all_nodes
 from emulator.surrogates.protocol import Prediction, fingerprint_of
 
-SAMPLERS = ("nuts", "blackjax_nuts", "mclmc", "smc", "laplace")
+SAMPLERS = ("nuts", "blackjax_nuts", "smc", "laplace")
 SHIFT, LOG_SD = 0.25, np.log(1.25)  # of moments, in posterior sd
 GRID = 1500
 

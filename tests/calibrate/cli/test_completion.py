@@ -53,7 +53,7 @@ def test_scenes_and_scene_files(ask):
 
 def test_emulators_samplers_recipes_and_options(ask):
     assert ask("evaluate", "liver") == {"liver", "liver_physics", "liver_pignn"}
-    assert ask("infer", "liver", "--sampler", "m") == {"mclmc"}
+    assert ask("infer", "liver", "--sampler", "s") == {"smc"}
     assert ask("train", "--recipe", "m") == {"mechanics", "modal"}
     assert ask("infer", "--noise") == {"--noise", "--noise-scale"}
 
@@ -63,7 +63,7 @@ def test_other_shells(shell, tmp_path):
     """Each has every command, and is a script that the shell itself can read, where it is there."""
     script = completion(shell)
     assert all(name in script for name in COMMANDS)
-    assert "delayed_acceptance" in script
+    assert "blackjax_nuts" in script
     assert "twice_clamped_beam" in script
     if found := shutil.which(shell):
         (tmp_path / "script").write_text(script)

@@ -3,11 +3,7 @@ import pytest
 
 import emulator as em
 from calibrate.figures import pyplot
-from calibrate.figures.evaluation import (
-    density_figure,
-    parameter_figure,
-    surface_figure,
-)
+from calibrate.figures.evaluation import density_figure, surface_figure
 from emulator.accuracy.comparison import Errors
 from emulator.geometry.facets import flat_triangles
 from emulator.geometry.refinement import to_quadratic
@@ -41,7 +37,7 @@ def errors(scene, cases=10, scale=1e-2, seed=0):
 
 def test_densities_and_their_marks():
     found = errors(block())
-    figure = density_figure(found, None, "title")
+    figure = density_figure(found, "title")
     axes = figure.axes[0]
     median, upper, curve = (line.get_xdata() for line in axes.lines)
     values = found.fields["err_u"]
@@ -59,21 +55,8 @@ def test_errors_that_are_all_zero_or_one_value_can_be_drawn():
     nothing = errors(scene, scale=0.0)
     one = errors(scene, cases=1)
     for found in (nothing, one):
-        density_figure(found, None, "").canvas.draw()
-        parameter_figure(scene, found, None, "").canvas.draw()
+        density_figure(found, "").canvas.draw()
     surface_figure(scene.mesh, nothing.fields["err_u"].mean(axis=0), "").canvas.draw()
-
-
-def test_a_map_of_two_parameters_and_panels_of_more():
-    scene = block()
-    figure = parameter_figure(scene, errors(scene), errors(scene, 4, seed=1), "")
-    inside, outside = figure.axes[0].collections[:2]
-    np.testing.assert_allclose(inside.get_offsets(), errors(scene).thetas)
-    np.testing.assert_allclose(
-        outside.get_array(), np.median(errors(scene, 4, seed=1).fields["err_u"], axis=1)
-    )
-    many = em.scenes.left_ventricle(rings=3, around=8, layers=1, order=1)
-    assert sum(axes.axison for axes in parameter_figure(many, errors(many), None, "").axes) == 5
 
 
 @pytest.mark.parametrize("order", [1, 2])

@@ -7,7 +7,7 @@ import pytest
 
 from calibrate.cli import main
 from calibrate.posterior import read_tree
-from calibrate.project.demo import DEMO
+from calibrate.project.demo import BEAM
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +23,7 @@ def test_the_demo_ends_accepted(demo):
     folder, report = demo
     assert report["verdict"] == "accepted"
     assert report["k_hat"] < report["certificate"]["k_threshold"]
-    for name, truth in DEMO.truth.items():
+    for name, truth in BEAM.truth.items():
         row = report["parameters"][name]
         assert row["truth"] == truth
         assert row["r_hat"] < 1.01

@@ -10,7 +10,7 @@ import calibrate as cal
 from calibrate.samplers import SAMPLERS, options_from
 from calibrate.samplers.checkpoint import Checkpoint
 from emulator.core.errors import InputError
-from linear_support import LinearFEM, linear_problem
+from linear_support import linear_problem
 
 
 class Killed(Exception):
@@ -40,9 +40,7 @@ def problem(beam):
 
 def run(problem, name, **more):
     model, data = problem
-    draws = 20 if SAMPLERS[name].solves_fem else 120
-    options = options_from(SAMPLERS[name], {}, warmup=60, draws=draws, chains=2)
-    more["simulator"] = LinearFEM(model.full.scene, model.full)
+    options = options_from(SAMPLERS[name], {}, warmup=60, draws=120, chains=2)
     return cal.sample(model, data, sampler=name, options=options, seed=5, predictions=False, **more)
 
 

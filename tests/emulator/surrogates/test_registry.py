@@ -5,7 +5,6 @@ import pytest
 import emulator as em
 from emulator.core.errors import InputError
 from emulator.surrogates.protocol import (
-    Extrapolated,
     ForwardKind,
     Ingredients,
     Option,
@@ -84,12 +83,7 @@ def test_every_kind_builds_a_map_with_its_name_and_its_own_fingerprint():
         assert again.fingerprint == maps[name].fingerprint
     loose = em.Simulator(scene, em.NewtonOptions(tolerance=1e-6))
     assert build_forward("fem", Ingredients(scene, loose)).fingerprint != maps["fem"].fingerprint
-    # Only a map in a box can be extrapolated.
-    wide = Ingredients(scene, simulator, extrapolate=True)
-    assert isinstance(build_forward("emulator", wide), Extrapolated)
-    outside = 1.5 * scene.centre
-    assert not maps["emulator"].evaluate(outside).valid
-    assert build_forward("emulator", wide).evaluate(outside).valid
+    assert not maps["emulator"].evaluate(1.5 * scene.centre).valid
 
 
 def test_only_a_fitted_map_is_kept(beam, simulator, tmp_path):

@@ -145,12 +145,6 @@ def prediction_summary(result: dict[str, Any]) -> str:
     _EMULATOR,
     option("--against", "DIR|fem", "a published model's folder, or our FEM", required=True),
     option("--cases", type=int, help="FEM runs when against fem (default 50)"),
-    option(
-        "--outside",
-        "FRACTION",
-        "evaluate at as many theta again outside the box, each side widened by this fraction",
-        type=float,
-    ),
     words.add_forward,
     option("--out", "DIR", "write evaluation.json and figures"),
     help="errors of an emulator against FEM",
@@ -183,25 +177,15 @@ def evaluate(arguments: Namespace) -> Answer:
 
 
 def evaluation_summary(report: Mapping[str, Any]) -> str:
-    """Return the tables of errors as text."""
-    lines = [_table(report, f"{report['cases']} cases")]
-    lines.append(f"forward map: {report['label']}, reference: {report['reference']}")
-    if report["invalid"]:
-        lines.append(f"{report['invalid']} further cases without a valid prediction")
-    if outside := report.get("outside"):
-        title = f"{outside['cases']} cases outside"
-        lines += ["", _table({**outside, "units": report["units"]}, title)]
-        lines.append(
-            f"box widened by {outside['fraction']:g} of each side; further cases: FEM failed at "
-            f"{outside['failed']}, the map had no valid prediction at {outside['invalid']}"
-        )
-    return "\n".join(lines)
-
-
-def _table(report: Mapping[str, Any], title: str) -> str:
+    """Return the table of errors as text."""
     rows = [
         (name, *(report[name][q] for q in ("median", "mean", "q97_5", "max")), unit)
         for name, unit in report["units"].items()
         if name in report
     ]
-    return table((title, "median", "mean", "97.5 %", "max", "unit"), rows)
+    title = f"{report['cases']} cases"
+    lines = [table((title, "median", "mean", "97.5 %", "max", "unit"), rows)]
+    lines.append(f"forward map: {report['label']}, reference: {report['reference']}")
+    if report["invalid"]:
+        lines.append(f"{report['invalid']} further cases without a valid prediction")
+    return "\n".join(lines)

@@ -42,7 +42,7 @@ def infer(arguments: Namespace) -> Answer:
             plan, folder, certify=certify, force=force, progress=progress
         )
         result = members_report(hierarchy, verdicts)
-        usable = {*verdicts.values()} <= {"accepted", "decided by FEM"}
+        usable = {*verdicts.values()} <= {"accepted"}
         return Answer(result, f"{members_summary(result)}\n{written}", usable)
     problem = read_problem(plan)
     run, (sampler, options) = problem.run, problem.run.sampling()
@@ -52,7 +52,7 @@ def infer(arguments: Namespace) -> Answer:
         )
     posterior = infer(problem, folder, force=force, check_map=not certify, progress=progress)
     certificate = None
-    if certify and not sampler.solves_fem:
+    if certify:
         certificate = certify_and_keep(
             posterior, folder, load_steps=run.load_steps, progress=progress
         )
@@ -196,12 +196,19 @@ def _add_demos(parser: ArgumentParser) -> None:
 )
 def demo(arguments: Namespace) -> Answer:
     """Run the demo and write its report."""
-    from calibrate.project.demo import run_demo
+    from calibrate.project.demo import BEAM, PICTURE, run_demo
+    from calibrate.project.results import REPORT
 
-    start = time.perf_counter()
+    start, is_beam = time.perf_counter(), arguments.scene == BEAM.scene
+    if not is_beam:
+        check_plotly("a report")
     result = run_demo(arguments.out, arguments.scene, progress=not arguments.json)
+    if not is_beam:
+        from calibrate.report import write_report
+
+        write_report(arguments.out)
     result["seconds"] = round(time.perf_counter() - start, 1)
-    names = ("posterior.nc", "certificate.json", result.pop("picture"))
+    names = ("posterior.nc", "certificate.json", PICTURE if is_beam else REPORT)
     result["files"] = [f"{arguments.out}/{name}" for name in names]
     lines = [posterior_summary(result)]
     if "identifiability" in result:

@@ -10,10 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.core.display import counting
 from emulator.core.errors import InputError
-from emulator.fem.campaign.campaign import Field, Neighbours, run_campaign, solve_rows
-from emulator.fem.campaign.workers import Solver
+from emulator.fem.campaign.campaign import run_campaign
 from emulator.fem.simulator import Simulator
 from emulator.scenes.scene import Scene
 
@@ -84,74 +82,18 @@ DESIGNS: dict[str, Callable[[Scene, int, int], jax.Array]] = {
 """Designs of a campaign by name; emulators are trained on the last."""
 
 
-def sample_outside(scene: Scene, cases: int, fraction: float) -> jax.Array:
-    """Return theta (cases, p) outside the box, but inside the box widened on both sides.
-
-    Values that law or loads do not admit are left out.
-
-    fraction : the fraction of each range by which it is widened at both ends, on its scale.
-    """
-    if not 0.0 < fraction < np.inf:
-        raise InputError(f"outside is {fraction}; give a fraction above 0, e.g. 0.25")
-    quantities = [scene.quantities[name] for name in scene.parameter_names]
-
-    def admissible(theta: np.ndarray) -> bool:
-        values = zip(quantities, theta.tolist(), strict=True)
-        return all(quantity.value_fault(value) is None for quantity, value in values)
-
-    count = 2 * cases
-    for _ in range(12):
-        position = scene.to_unit(sobol(scene, count, TEST_SEED + 1))
-        thetas = scene.from_unit(position * (1.0 + 2.0 * fraction) - fraction)
-        outside = ~np.asarray(scene.space.contains(thetas))
-        valid = outside & [admissible(theta) for theta in np.asarray(thetas)]
-        if valid.sum() >= cases:
-            return thetas[np.flatnonzero(valid)[:cases]]
-        count *= 2
-    raise InputError(f"outside {fraction:g}: next to nothing there is a value the scene takes")
-
-
 class Reference(NamedTuple):
     """Reference solutions to evaluate forward maps against.
 
     thetas : (c, p). displacement : (c, n, 3) mm. source : where the solutions come from.
-    failed : the number of solves without a solution.
     """
 
     thetas: jax.Array
     displacement: jax.Array
     source: str
-    failed: int = 0
 
 
 def fem_reference(simulator: Simulator, cases: int, *, progress: bool = False) -> Reference:
     """Solve at ``cases`` theta over the box; :class:`SolverError` when one fails."""
     runs = run_campaign(simulator, sobol(simulator.scene, cases, TEST_SEED), progress=progress)
     return Reference(runs.theta, runs.displacement, "our FEM")
-
-
-def outside_reference(
-    simulator: Simulator, cases: int, fraction: float, inside: Reference, *, progress: bool = False
-) -> Reference:
-    """Solve outside the box, each run started from the nearest solution, or else from rest.
-
-    Runs that do not converge are left out and counted.
-
-    cases, fraction : as for :func:`sample_outside`. inside : solutions to start from.
-    """
-    scene = simulator.scene
-    thetas = jnp.concatenate([inside.thetas, sample_outside(scene, cases, fraction)])
-    solutions = {number: Field(u) for number, u in enumerate(inside.displacement)}
-    results = solve_rows(
-        Solver(simulator),
-        thetas,
-        numbers=range(len(inside.thetas), len(thetas)),
-        starts=Neighbours(scene, thetas, solutions),
-    )
-    for row in counting(results, "FEM outside", total=cases, disable=not progress, unit="run"):
-        if row.converged:
-            solutions[row.number] = Field(row.solution.displacement)
-    numbers = np.array(list(solutions)[len(inside.thetas) :], int)
-    found = [solutions[number].displacement for number in numbers]
-    displacement = jnp.stack(found) if found else jnp.zeros((0, *scene.held.shape))
-    return Reference(thetas[numbers], displacement, "our FEM", cases - len(found))

@@ -175,9 +175,6 @@ def _value(quantity: Quantity, position: np.ndarray) -> np.ndarray:
     return low + (high - low) * (0.1 + 0.8 * position)
 
 
-Volumetric = Callable[[Strain, jax.Array], jax.Array]
-
-
 def quadratic(strain: Strain, kappa: jax.Array) -> jax.Array:
     """Return ``kappa/2 (J-1)^2`` in the unit of ``kappa``; finite even for an inverted point."""
     return 0.5 * kappa * strain.J_minus_1**2
