@@ -17,7 +17,7 @@ from surface_support import write
 
 SETS = ("lv_endocardium", "rv_endocardium", "epicardium")
 FRAMES = range(0, 25, 2)
-LID = 3.0  # mm of tissue above the cavities of a heart with valves
+LID = 6.0  # mm of tissue above the cavities of a heart with valves
 
 
 def needs_gmsh():
@@ -62,14 +62,21 @@ def with_valves(flat, seed):
     right = flat[1].points[rim_loops(flat[1])[0]]
     middle, reach = left[:, :2].mean(axis=0), np.ptp(left[:, 0]) / 2.0
     away = np.array([np.cos(turn), np.sin(turn)])
-    holes = [(middle - 0.42 * reach * away, 0.4 * reach), (middle + 0.5 * reach * away, 0.3 * reach)]
+    holes = [
+        (middle - 0.42 * reach * away, 0.4 * reach),
+        (middle + 0.5 * reach * away, 0.3 * reach),
+    ]
     # The right ventricle is a crescent: valves along the middle of its width.
     about = np.arctan2(*(right[:, :2] - middle).T[::-1])
     places = []
-    for share in (rng.uniform(0.25, 0.35), rng.uniform(0.65, 0.75)):
+    for share, part in ((rng.uniform(0.38, 0.46), 0.4), (rng.uniform(0.66, 0.72), 0.36)):
+        near = np.abs(about - about.min() - share * np.ptp(about)) < 0.15
+        ways = np.linalg.norm(right[near, :2] - middle, axis=1)
         angle = about.min() + share * np.ptp(about)
-        near = np.abs(about - angle) < 0.15
-        places.append((right[near, :2].mean(axis=0), rng.uniform(3.5, 4.5)))
+        way = (ways.min() + ways.max()) / 2.0
+        places.append(
+            (middle + way * np.array([np.cos(angle), np.sin(angle)]), part * np.ptp(ways))
+        )
     return [
         with_lid(flat[0], 0.0, holes),
         with_lid(flat[1], 0.0, places),
@@ -97,11 +104,11 @@ def test_a_heart_with_a_flat_base(flat):
 def test_valves_may_be_anywhere(flat, seed):
     needs_gmsh()
     surfaces = with_valves(flat, seed)
-    found = mesh_heart(*surfaces, size=7.0)
+    found = mesh_heart(*surfaces, size=6.0)
     sets = found.mesh.facet_sets
     assert {"mitral", "aortic", "tricuspid", "pulmonary", "base"} < set(sets)
     for name, (cavity, own) in found.cavities.items():
-        assert cavity == pytest.approx(own, rel=0.01)
+        assert cavity == pytest.approx(own, rel=0.03)  # the lid's edge is rounded off
         assert Cavity(found.mesh, name).rest == cavity
     assert len(sets["base"]) == sum(len(sets[n]) for n in set(sets) - {*SETS, "base"})
     assert found.wall[0] == pytest.approx(found.wall[1], rel=0.02)

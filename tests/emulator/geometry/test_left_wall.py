@@ -58,8 +58,8 @@ def test_by_the_command_line(surfaces, tmp_path, capsys):
     ]
     words = ["mesh", "--endocardium", files[0], "--epicardium", files[1], "--out"]
     out = str(tmp_path / "lv.vtu")
-    assert main([*words, out, "--right", files[2], "--size", "12"]) == 0
-    assert "cavity over wall 0.7" in capsys.readouterr().out
+    assert main([*words, out, "--right", files[2], "--ventricles", "left", "--size", "12"]) == 0
+    assert "over the wall 0.7" in capsys.readouterr().out
     assert "does not exist" in complaint(capsys, *words, out, "--right", "nowhere.stl")
 
 
@@ -74,8 +74,12 @@ def test_every_frame_of_a_real_heart_is_meshed(measured):
         )
         found = mesh_wall(inner, outer, right=right)
         own = read_surface(inner, "endocardium").volume / 1000.0
-        assert 0.75 * own < found.cavity[0] < own  # the rest is above the base plane
-        assert found.cavity[0] == pytest.approx(found.cavity[1], rel=5e-3)
+        assert (
+            0.75 * own < found.cavities["endocardium"][0] < own
+        )  # the rest is above the base plane
+        assert found.cavities["endocardium"][0] == pytest.approx(
+            found.cavities["endocardium"][1], rel=5e-3
+        )
         assert found.thickness.least > 2.5
         assert found.quality.angle > 8.0
         assert found.warnings == ()

@@ -5,7 +5,7 @@ import pytest
 
 from emulator.core.errors import InputError
 from emulator.geometry.generators.ellipsoid import disc
-from emulator.geometry.remeshing import DiscMap
+from emulator.geometry.remeshing import DiscMap, Remeshed
 from emulator.geometry.surfaces import (
     Surface,
     cut,
@@ -87,8 +87,9 @@ def test_no_triangle_of_a_cap_turns_over(ball):
     u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     sign = np.sign(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
     assert abs(sign.sum()) == len(sign)
-    one, other = flat.places[:200], flat.places[200:400]
-    middle, ends = flat.middles(one, other), (flat.at(one), flat.at(other))
+    whole = Remeshed(cap, flat.places, ())
+    edges = np.arange(400).reshape(2, 200).T
+    middle, ends = flat.middles(whole, edges), [flat.at(flat.places[k]) for k in edges.T]
     near = [np.linalg.norm(middle - end, axis=1) for end in ends]
     np.testing.assert_allclose(*near, atol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(middle, axis=1), 10.0, atol=0.1)

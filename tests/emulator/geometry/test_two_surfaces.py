@@ -55,9 +55,11 @@ def made(rough):
 
 
 def test_volumes_and_thickness_are_those_of_the_ellipsoids(made):
-    assert made.cavity[0] == pytest.approx(HUMAN.cavity_volume / 1000.0, rel=0.01)
+    assert made.cavities["endocardium"][0] == pytest.approx(HUMAN.cavity_volume / 1000.0, rel=0.01)
     assert made.wall[0] == pytest.approx(HUMAN.volume / 1000.0, rel=0.01)
-    assert made.cavity[0] == pytest.approx(made.cavity[1], rel=2e-3)
+    assert made.cavities["endocardium"][0] == pytest.approx(
+        made.cavities["endocardium"][1], rel=2e-3
+    )
     assert 6.5 < made.thickness.least < 7.5  # 7 at the apex
     assert 10.8 < made.thickness.most < 11.3  # 11 at the equator
     assert made.local_thickness().max() < 13.0
@@ -86,7 +88,7 @@ def test_open_surfaces_anywhere_tell_their_axis(open_ones):
     found = mesh_wall(*open_ones, unit="cm", size=9.0, order=1)
     np.testing.assert_allclose(found.axis, TURN[:, 2], atol=1e-4)
     np.testing.assert_allclose(found.base, TURN[:, 2] * HUMAN.base + SHIFT, atol=0.1)
-    assert found.cavity[1] == pytest.approx(HUMAN.cavity_volume / 1000.0, rel=0.01)
+    assert found.cavities["endocardium"][1] == pytest.approx(HUMAN.cavity_volume / 1000.0, rel=0.01)
     assert found.cut_off == (0.0, 0.0)
     assert any("more than 1 % off" in line for line in found.sentences())  # linear and coarse
 
@@ -175,7 +177,7 @@ def test_the_command_draws_and_what_it_wrote_is_solved(rough, tmp_path, capsys):
         "--out", out, "--picture", picture,
     )  # fmt: skip
     assert code == 0
-    assert told["cavity"]["mesh"] == pytest.approx(HUMAN.cavity_volume / 1000.0, rel=0.02)
+    assert told["cavities"]["endocardium"]["mesh"] == pytest.approx(HUMAN.cavity_volume / 1000.0, rel=0.02)
     assert picture.stat().st_size > 10_000
     scene = draft_scene(out, tmp_path / "lv.toml").scene
     assert Simulator(scene).solve(scene.centre).converged
