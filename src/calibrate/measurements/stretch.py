@@ -44,9 +44,9 @@ class Stretch(Components):
     scene: Scene
     components: tuple[str, ...]
 
-    kind = "stretch"
-    usage = "stretch:COMPONENT,..."
-    hint = ", such as stretch:stretch_x,stretch_y"
+    kind = "stretches"
+    usage = "stretches:COMPONENT,..."
+    hint = ", such as stretches:stretch_x,stretch_y"
     name = "stretch"
     quantity = "stretch"
     unit = "1"

@@ -111,6 +111,6 @@ def test_written_and_read_again(tmp_path):
         np.testing.assert_array_equal(data["stretch"], values)
     again = observations_from_json(scene, observe.to_json())
     assert again.parts["stretch"].components == ("stretch_x", "stretch_z")
-    assert parse_observation(scene, "stretch:stretch_x").shapes == {"stretch": (5, 1)}
+    assert parse_observation(scene, "stretches:stretch_x").shapes == {"stretch": (5, 1)}
     with pytest.raises(InputError, match="stretch 'strain_x' is unknown; one of stretch_x"):
-        parse_observation(scene, "stretch:strain_x")
+        parse_observation(scene, "stretches:strain_x")

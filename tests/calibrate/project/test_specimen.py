@@ -210,7 +210,7 @@ def load_control():
     return "\n".join(rows) + "\n"
 
 
-def test_load_control_from_a_table_to_draws(tmp_path, monkeypatch, capsys):
+def test_load_control_has_its_files_by_one_command(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "test.csv").write_text(load_control())
     words = ["--law", "holzapfel_ogden_isotropic"]
@@ -224,6 +224,14 @@ def test_load_control_from_a_table_to_draws(tmp_path, monkeypatch, capsys):
     assert set(problem.run.noise) == {"stress", "stretch"}
     scene = read_scene(tmp_path / "test_scene.toml")
     assert scene.space.theta({"a": A, "b": B}, "truth is in the ranges").shape == (2,)
+
+
+@pytest.mark.slow
+def test_load_control_has_the_laws_parameters(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "test.csv").write_text(load_control())
+    assert main(["init", "test.csv", "--law", "holzapfel_ogden_isotropic"]) == 0
+    capsys.readouterr()
     assert main(["infer", "test.toml", "--out", "run", "--no-certify", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["parameters"]
     for name, truth in (("a", A), ("b", B)):
