@@ -23,6 +23,7 @@ from .measurements import (
     spread_landmarks,
     strains,
     stresses,
+    stretches,
     surface_distances,
     surface_points,
 )
@@ -140,6 +141,7 @@ __all__ = [
     "strains",
     "stress_band",
     "stresses",
+    "stretches",
     "surface_distances",
     "surface_points",
     "truncated",

@@ -35,6 +35,7 @@ from calibrate.measurements.points import DISPLACEMENT
 from calibrate.measurements.reaction import Reaction
 from calibrate.measurements.strain import SegmentStrain, Strain, segment_strains, strains
 from calibrate.measurements.stress import Stress, stresses
+from calibrate.measurements.stretch import Stretch, stretches
 from calibrate.measurements.surface import (
     RigidMarkers,
     SurfacePoints,
@@ -64,6 +65,7 @@ OBSERVATIONS: dict[str, type[Observation]] = {
         Length,
         Reaction,
         Stress,
+        Stretch,
         TubePressure,
         TubeForce,
         MeasuredParameter,
@@ -83,6 +85,7 @@ __all__ = [
     "Reaction",
     "Scalar",
     "Stress",
+    "Stretch",
     "TubeForce",
     "TubePressure",
     "landmarks",
@@ -100,6 +103,7 @@ __all__ = [
     "spread_on_surface",
     "strains",
     "stresses",
+    "stretches",
     "surface_distances",
     "surface_points",
 ]

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Self
+from typing import ClassVar, Self
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,7 @@ from calibrate.noise.protocol import Sites
 from emulator.core.errors import InputError
 from emulator.scenes.scene import Scene, all_nodes
 from emulator.scenes.specimen import measured_states, states_in
-from emulator.scenes.states import AXES, States
+from emulator.scenes.states import APPLIED, AXES, States
 
 _APART = 1e3  # distance between the sites of two tests, whose errors do not correlate
 _ROUND_OFF = 1e-6
@@ -37,6 +38,10 @@ class SpecimenCurves(PointObservation):
     constants = {"stretch": "stretches"}
     curve_axis = "way from the first state of each test, in stretch"
     positive = False
+    at_rest: ClassVar[float] = 0.0
+    """The number that is measured at rest."""
+    usual_length: ClassVar[tuple[float, str]] = (0.1, "of stretch")
+    """Way along a curve over which errors correlate in a first experiment file, and its unit."""
 
     def __post_init__(self) -> None:
         measured_states(self.scene)  # refuses what is no specimen
@@ -69,7 +74,7 @@ class SpecimenCurves(PointObservation):
 
     @cached_property
     def paths(self) -> np.ndarray:
-        """The way of each state from the first of its test, in stretch, and the test's place."""
+        """The way of each state from the first of its test, and the test's place."""
         paths = np.zeros((len(self.states.free), 3))
         paths[:, 0] = self.states.paths
         for number, rows in enumerate(self.tests.values()):
@@ -78,7 +83,7 @@ class SpecimenCurves(PointObservation):
 
     @property
     def sites(self) -> Sites:
-        """The way along each test in stretch, so that errors correlate along its curve."""
+        """The way along each test, so that errors correlate along its curve."""
         sites = Sites.of(self.paths, max(len(self.components), 1))
         return sites if self.entries is None else Sites(*(each[self.entries] for each in sites))
 
@@ -90,7 +95,7 @@ class SpecimenCurves(PointObservation):
 
     @property
     def curves(self) -> Mapping[str, tuple[np.ndarray, np.ndarray]]:
-        """The curve of each test and component, over the way in stretch."""
+        """The curve of each test and component, over the way from its first state."""
         names = self.components or (self.name,)
         every = np.arange(len(self.paths) * len(names))
         states, columns = np.divmod(every if self.entries is None else self.entries, len(names))
@@ -122,8 +127,11 @@ class SpecimenCurves(PointObservation):
                 f"has {len(expected.free)} states"
             )
         apart = np.abs(found.gradients[::each] - expected.gradients).max(axis=(1, 2))
+        pulled = np.abs(found.pulls[::each] - expected.pulls).max(axis=1)
         other = np.flatnonzero(
-            (apart > _ROUND_OFF) | (found.free[::each] != expected.free).any(axis=1)
+            (apart > _ROUND_OFF)
+            | (pulled > _ROUND_OFF * np.abs(expected.pulls).max())
+            | (found.free[::each] != expected.free).any(axis=1)
         )
         if len(other):
             raise InputError(
@@ -131,8 +139,11 @@ class SpecimenCurves(PointObservation):
             )
         return self
 
-    def motion(self) -> Block:
-        """Return the columns of a data file that say how the specimen moves."""
+    def motion(self, also: Sequence[str] = ()) -> Block:
+        """Return the columns of a data file that say how the specimen moves and is pulled.
+
+        also : columns that are there even if they say nothing, of zeros or NaN.
+        """
         if self.scene.tube is not None:
             arrays = self.scene.tube.motion(self.stretches)
         else:
@@ -143,17 +154,41 @@ class SpecimenCurves(PointObservation):
                 for j, b in enumerate(AXES)
                 if i != j
             }
-        return [(Field(word, (word,)), x) for word, x in arrays.items() if np.nan_to_num(x).any()]
+            pulls = np.where(self.states.free, self.states.pulls, np.nan)
+            arrays |= {f"{APPLIED}_{a}": pulls[:, k] for k, a in enumerate(AXES)}
+        kept = {w: x for w, x in arrays.items() if w in also or np.nan_to_num(x).any()}
+        return [(Field(word, (word,)), x) for word, x in kept.items()]
 
 
-def factor(word: str, unit: str, usual: str, known: Mapping[str, float]) -> float:
-    """Return the factor from a column's unit, ``usual`` where it has none."""
-    plain = unit.replace("²", "2").replace("^", "") or usual
-    if plain not in known:
-        raise InputError(f"column '{word}': unit '{unit}' is unknown; one of {', '.join(known)}")
-    return known[plain]
+class Components(SpecimenCurves):
+    """Components (c) of what was measured in each of the d states of a specimen, not of a tube.
+
+    A kind declares the ``pattern`` of the components' names, and ``such_as`` for errors.
+    """
+
+    components: tuple[str, ...]
+
+    pattern: ClassVar[re.Pattern[str]]
+    such_as: ClassVar[str]
+    arguments = ("components",)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.scene.tube is not None:
+            raise InputError(
+                f"scene '{self.scene.name}' is a tube, which is measured by pressure and "
+                "force_axial"
+            )
+        for component in self.components:
+            if self.pattern.fullmatch(component) is None:
+                raise InputError(f"{self.quantity} '{component}' is unknown; {self.such_as}")
+
+    @classmethod
+    def of(cls, scene: Scene, components: str | Sequence[str]) -> Self:
+        """Return the observation of ``components``, as text joined by commas."""
+        texts = components.split(",") if isinstance(components, str) else components
+        return cls(scene, tuple(str(text) for text in texts))  # type: ignore[call-arg]
 
 
-IN_KPA = {"kPa": 1.0, "Pa": 1e-3, "MPa": 1e3, "mmHg": 0.13332239, "g/cm2": 0.0980665}
 IN_MN = {"mN": 1.0, "N": 1e3, "g": 9.80665, "gf": 9.80665, "kN": 1e6}
-"""Units of columns of stresses in kPa, and of forces in mN."""
+"""Units of columns of forces in mN."""

@@ -23,7 +23,7 @@ in mm2.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from copy import copy
 from dataclasses import dataclass
 from typing import Self
@@ -33,11 +33,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibrate.measurements.observation import Block, Field, Table
-from calibrate.measurements.specimens import IN_KPA, IN_MN, SpecimenCurves, factor
+from calibrate.measurements.specimens import IN_MN, Components
 from emulator.core.errors import InputError
 from emulator.mechanics.kinematics import cofactor, determinant
 from emulator.scenes.scene import Scene
-from emulator.scenes.states import AXES, motion_columns, with_unit
+from emulator.scenes.states import (
+    AXES,
+    IN_KPA,
+    components_of,
+    factor,
+    motion_columns,
+    pull_columns,
+    with_unit,
+)
 from emulator.surrogates.gripped import added, gripped_stresses
 from emulator.surrogates.homogeneous import homogeneous_stresses
 
@@ -48,7 +56,7 @@ _IN_MM2 = {"mm2": 1.0, "cm2": 100.0, "m2": 1e6}
 
 
 @dataclass(frozen=True, eq=False)
-class Stress(SpecimenCurves):
+class Stress(Components):
     """Stresses (d, c) of ``components`` (c) in the d states of a specimen, in kPa.
 
     :class:`InputError` for a scene that is no specimen, or an unknown component.
@@ -66,33 +74,17 @@ class Stress(SpecimenCurves):
     usage = "stress:COMPONENT,..."
     hint = ", such as stress:stress_x,stress_y"
     name = "stress"
-    arguments = ("components",)
     quantity = "stress"
+    pattern = _COMPONENT
+    such_as = "give stress, cauchy or second with its plane, such as stress_x or stress_xy"
     unit = "kPa"
     other_units = {"MPa": 1e3, "Pa": 1e-3, "mmHg": 0.13332239}
     value_fields = (Field("stress_x", ("stress_x",)),)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.scene.tube is not None:
-            raise InputError(
-                f"scene '{self.scene.name}' is a tube, whose stresses are measured by pressure and "
-                "force_axial"
-            )
-        for component in self.components:
-            if _COMPONENT.fullmatch(component) is None:
-                raise InputError(
-                    f"stress '{component}' is unknown; give stress, cauchy or second with its "
-                    "plane, such as stress_x or stress_xy"
-                )
         if self.scene.grips is not None and self.scene.grips.learned is not None:
             self._check_grips(self.scene.grips.learned.shares[0])
-
-    @classmethod
-    def of(cls, scene: Scene, components: str | Sequence[str]) -> Self:
-        """Return the observation of ``components``, as text joined by commas."""
-        texts = components.split(",") if isinstance(components, str) else components
-        return cls(scene, tuple(str(text) for text in texts))
 
     def gripped(self, shares: np.ndarray) -> Self:
         """Return the same stresses with what grips add, (d, 3, 3) as shares of a state's stress.
@@ -131,6 +123,8 @@ class Stress(SpecimenCurves):
     def tables(cls, words: Collection[str]) -> dict[str, Table]:
         """Return the table of the columns of motions and stresses; of one each as an example."""
         given = [word for word in words if is_stress(word)]
+        if not given and pull_columns(words):  # of measured stretches
+            return {}
         areas = [w for w in words if given and _AREA.fullmatch(with_unit(w)[0])]
         columns = [*(motion_columns(words) or ["stretch_x"]), *(given or ["stress_x"]), *areas]
         return {cls.name: Table((), tuple(Field(word, (word,)) for word in columns))}
@@ -145,6 +139,14 @@ class Stress(SpecimenCurves):
         part = cls(scene, tuple(columns)).check_motion(motions)
         values = np.column_stack(list(columns.values()))
         part._check_signs(values)
+        pulled = ~np.isnan(components_of(motions)[1])
+        for component, each in columns.items():
+            _, row, column = _parts(component)
+            if row == column and (pulled[:, row] & ~np.isnan(each)).any():
+                raise InputError(
+                    f"column '{component}' is the stress of a direction that has 'applied_"
+                    f"{AXES[row]}': what the machine applies is no data, leave the column out"
+                )
         return part, values
 
     def _check_signs(self, values: np.ndarray) -> None:

@@ -16,11 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibrate.measurements.observation import Block, Field, Table
-from calibrate.measurements.specimens import IN_KPA, IN_MN, SpecimenCurves, factor
+from calibrate.measurements.specimens import IN_MN, SpecimenCurves
 from emulator.core.errors import InputError
 from emulator.mechanics.kinematics import determinant
 from emulator.scenes.scene import Scene
-from emulator.scenes.states import with_unit
+from emulator.scenes.states import IN_KPA, factor, with_unit
 from emulator.scenes.tube import Tube, motion_columns
 from emulator.surrogates.homogeneous import homogeneous_stresses
 

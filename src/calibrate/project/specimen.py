@@ -8,7 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from calibrate.measurements.data import read_measurements
-from calibrate.measurements.stress import Stress, is_stress
+from calibrate.measurements.specimens import SpecimenCurves
+from calibrate.measurements.stress import is_stress
+from calibrate.measurements.stretch import Stretch
 from calibrate.measurements.tube import TubeForce, TubePressure
 from emulator.core.cells import read_cells
 from emulator.core.errors import InputError
@@ -18,7 +20,7 @@ from emulator.scenes.file import read_scene
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
 from emulator.scenes.specimen import measured_states, read_states, specimen
-from emulator.scenes.states import AXES, States, with_unit
+from emulator.scenes.states import AXES, States, pull_columns, with_unit
 from emulator.scenes.tube import Tube
 
 _MODULI = (0.005, 3.0)  # range of a modulus, as a share of the largest stress over its strain
@@ -32,8 +34,7 @@ _GRIPS = (
     '# held = "clamped"   # or "hooks"',
     "# marks = 2.0   # mm, side of the square in which stretches were measured; not of the grips",
 )
-_STRESSES = (Stress.kind, TubePressure.kind, TubeForce.kind)
-_LENGTH = 0.1  # over which errors along a curve correlate, in stretch
+_Sizes = dict[str, tuple[SpecimenCurves, float]]  # each measurement, and its largest way from rest
 
 
 class SpecimenDraft(NamedTuple):
@@ -82,21 +83,30 @@ def draft_specimen(
     given = read_states(table, tube)
     count = len(given.free) // (tube.size if tube else 1)
     largest, slope = _size(table, given, tube)
-    axes = [a for k, a in enumerate(AXES) if (np.abs(given.gradients[:, k, k]) > 0.0).any()]
+    moved = (np.diagonal(given.gradients, axis1=1, axis2=2) != 0.0) | (given.pulls != 0.0)
+    axes = [axis for axis, own in zip(AXES, moved.T, strict=True) if own.any()]
     chosen = "holzapfel_gasser_ogden" if len(axes) > 1 else "holzapfel_ogden_isotropic"
     material = find_law(law or chosen)
     notes = [
         f"{count} states in {_tests(given)}",
         f"law {material.name}" + ("" if law else ": a guess, give --law NAME"),
-        *(f"{name} reaches {most:.3g} {unit}" for name, (most, unit) in largest.items()),
+        *(
+            f"{name} reaches {part.at_rest + most:.3g} {part.unit}".removesuffix(" 1")
+            for name, (part, most) in largest.items()
+        ),
         f"ranges of moduli follow from a stiffness of {slope:.3g} kPa",
         "incompressible, --forward homogeneous takes the law's kappa; FEM, which checks, takes it, "
         "too",
-        f"errors along a curve correlate over {_LENGTH:g} of stretch, their sds are inferred",
+        *(
+            f"errors along a curve of {name} correlate over {part.usual_length[0]:g} "
+            f"{part.usual_length[1]}, their sds are inferred"
+            for name, (part, _) in largest.items()
+        ),
     ]
     of_tube = (TubePressure.column, TubeForce.column)
     names = {word: with_unit(word) for word in read_cells(table).words}
-    measured = [w for w, (name, _) in names.items() if is_stress(w) or name in of_tube]
+    pulls = pull_columns(names).values()
+    measured = [w for w, (n, _) in names.items() if is_stress(w) or w in pulls or n in of_tube]
     if bare := [w for w in measured if not names[w][1]]:
         notes.insert(1, f"{', '.join(bare)} without a unit: kPa, forces mN; others in brackets")
     left_out = len(_every_row(table)) - count
@@ -107,6 +117,8 @@ def draft_specimen(
     name = source.relative_to(folder) if source.is_relative_to(folder) else source
     scene_path.parent.mkdir(parents=True, exist_ok=True)
     text = _scene_text(material, name.as_posix(), axes, slope, tube)
+    if tube is None and not given.pulls.any():
+        text += "\n".join(["", *_GRIPS, ""])
     scene_path.write_text(text, encoding="utf-8")
     try:
         scene = read_scene(scene_path)
@@ -126,13 +138,11 @@ def _tests(given: States) -> str:
     return f"{len(names)} tests ({', '.join(names)})" if len(names) > 1 else "one test"
 
 
-def _size(
-    table: Path, given: States, tube: Tube | None
-) -> tuple[dict[str, tuple[float, str]], float]:
-    """Return the largest value and the unit of each measurement, and the tissue's stiffness in kPa.
+def _size(table: Path, given: States, tube: Tube | None) -> tuple[_Sizes, float]:
+    """Return the size of each measurement, and the tissue's stiffness in kPa.
 
-    A stress over the motion there, where it is largest; of a tube, the stress of a thin wall,
-    pressure times inner radius over thickness, or force over section.
+    A stress over the motion there, where it is largest, either measured or prescribed; of a tube,
+    the stress of a thin wall, pressure times inner radius over thickness, or force over section.
     """
     neutral = specimen(
         given, law=find_law("neo_hookean_split"), tube=tube,
@@ -140,24 +150,30 @@ def _size(
             "kappa": 10.0, **dict.fromkeys(_stiffnesses(tube), 1.0)},
     )  # fmt: skip
     observe, data, _ = read_measurements(neutral, table)
-    kinds = {part.kind for part in observe.parts.values()}
-    if not kinds <= set(_STRESSES):
+    parts = {n: part for n, part in observe.parts.items() if isinstance(part, SpecimenCurves)}
+    if len(parts) < len(data):
         raise InputError(f"data file {table} has {', '.join(observe.parts)} besides stresses")
-    sizes = {
-        name: (float(np.nanmax(np.abs(values))), observe.parts[name].unit)
-        for name, values in data.items()
+    ways = {
+        name: np.nan_to_num(np.abs(data[name] - part.at_rest)).reshape(len(data[name]), -1)
+        for name, part in parts.items()
     }
-    for name, (most, _) in sizes.items():
+    sizes = {name: (part, float(ways[name].max())) for name, part in parts.items()}
+    for name, (part, most) in sizes.items():
         if not most > 0.0:
-            raise InputError(f"data file {table}: each {name} is zero")
-    first = next(iter(data))
-    stress = np.nan_to_num(np.abs(data[first])).reshape(len(data[first]), -1).max(axis=1)
-    gradients = measured_states(neutral).gradients
+            raise InputError(f"data file {table}: each {name} is {part.at_rest or 'zero'}")
+    neutral_states = measured_states(neutral)
+    motion = np.abs(neutral_states.gradients).max(axis=(1, 2))
+    stress = np.abs(neutral_states.pulls).max(axis=1)
+    stretches = ways.pop(Stretch.name, None)
+    if stretches is not None:
+        motion = np.maximum(motion, stretches.max(axis=1))
+    first = next(iter(ways), None)
+    if first is not None:
+        stress = np.maximum(stress, ways[first].max(axis=1))
     if tube is not None:
         area = np.pi * (tube.outer_radius**2 - tube.inner_radius**2)
         thin = tube.inner_radius / sum(tube.layers)
         stress = stress * (thin if first == TubePressure.name else 1.0 / area)
-    motion = np.abs(gradients).max(axis=(1, 2))
     moved = motion > 0.1 * motion.max()
     return sizes, float((stress[moved] / motion[moved]).max())
 
@@ -195,7 +211,7 @@ def _scene_text(law: Law, table: str, axes: list[str], slope: float, tube: Tube 
         constants.append(f"kappa = {kappa:.2g}   # kPa")
     lines += ["", "[constants]", *constants] if constants else []
     if tube is None:
-        return "\n".join([*lines, "", *_GRIPS]) + "\n"
+        return "\n".join(lines) + "\n"
     lines += ["", "[tube]   # the sector that it opens to when it is cut, without stress"]
     lines.append(f"inner_radius = {tube.inner_radius}   # mm")
     lines.append(f"layers = {list(tube.layers)}   # mm, from the inside out")
@@ -222,19 +238,18 @@ def _parameter(quantity: Quantity, slope: float) -> list[str]:
     ]
 
 
-def _experiment_text(
-    scene: str, table: str, sizes: dict[str, tuple[float, str]], notes: list[str]
-) -> str:
+def _experiment_text(scene: str, table: str, sizes: _Sizes, notes: list[str]) -> str:
     head = ["# A first experiment file; what was guessed:", *(f"# - {note}" for note in notes)]
     head += ["", f'scene = "{scene}"', f'data = "{table}"', 'forward = "incompressible"']
-    for name, (largest, unit) in sizes.items():
-        sd = f"{_NOISE * largest:.2g}"
+    for name, (part, largest) in sizes.items():
+        sd, (length, of_what) = f"{_NOISE * largest:.2g}", part.usual_length
+        unit = "" if part.unit == "1" else f"{part.unit}, "
         head += [
             "",
             f"[noise.{name}]",
             'kind = "correlated"',
-            f"length = {_LENGTH}   # of stretch, along a curve",
-            f"sd_scale = {sd}   # {unit}, of the independent errors' sd",
-            f"spatial_sd_scale = {sd}   # {unit}, of those that correlate",
+            f"length = {length}   # {of_what}, along a curve",
+            f"sd_scale = {sd}   # {unit}of the independent errors' sd",
+            f"spatial_sd_scale = {sd}   # {unit}of those that correlate",
         ]
     return "\n".join([*head, ""])

@@ -18,6 +18,7 @@ from emulator.geometry.side_by_side import check_name, shifted, side_by_side
 from emulator.mechanics.laws import Law, find_law
 from emulator.scenes.grips import Grips, Learned
 from emulator.scenes.parameter_space import Parameter
+from emulator.scenes.part import Load
 from emulator.scenes.scene import Scene
 from emulator.scenes.scene_data import directions_read
 from emulator.scenes.specimen import body_of, read_states
@@ -50,11 +51,11 @@ def read_scene(path: str | Path) -> Scene:
     file = parse(SceneFile, source)
     with source.at("law"):
         law = find_law(file.law)
-    supports, regions = file.supports, None
+    supports, loads, regions = file.supports, file.loads, None
     with source.at("tube", table=("tube",)):
         tube = _tube(file)
     if file.specimen is not None:
-        body, supports = _specimen(path.parent, file, tube, source)
+        body, supports, loads = _specimen(path.parent, file, tube, source)
         regions = tube.regions(len(body.mesh.elements)) if tube is not None else None
     elif not supports:
         raise source.error("key 'supports' is missing; expected tables [[supports]]")
@@ -84,7 +85,7 @@ def read_scene(path: str | Path) -> Scene:
             sheets=sheets if law.sheets else None,
             regions=regions,
             parameters=tuple(parameters),
-            loads=file.loads,
+            loads=loads,
             supports=supports,
             constants=file.constants,
             dilatation=file.dilatation,
@@ -98,15 +99,15 @@ def read_scene(path: str | Path) -> Scene:
 
 def _specimen(
     folder: Path, file: SceneFile, tube: Tube | None, source: Source
-) -> tuple[Body, tuple[Support, ...]]:
-    """Return the states of the table ``specimen`` as bodies, and the supports that hold them."""
+) -> tuple[Body, tuple[Support, ...], tuple[Load, ...]]:
+    """Return the states of the table ``specimen`` as bodies, and what holds and pulls them."""
     for key in ("mesh", "bodies", "regions", "supports", "loads", "order"):
         if key in source.data:
             raise source.error("a specimen has none; it is held and moved by its table", (key,))
     with source.at("specimen"):
         assert file.specimen is not None
-        mesh, supports = body_of(read_states(folder / file.specimen, tube))
-    return Body(mesh), supports
+        mesh, supports, loads = body_of(read_states(folder / file.specimen, tube))
+    return Body(mesh), supports, loads
 
 
 def _tube(file: SceneFile) -> Tube | None:

@@ -131,15 +131,16 @@ class Part(ABC):
     def to_json(self) -> list[Any] | None:
         """Return kind and every field as plain JSON, for fingerprints; or None for nothing.
 
-        Numbers are floats, -0.0 is 0.0, and the entries of a tuple stand one by one. The name of
-        the parameter is None where the magnitude is a number.
+        Numbers are floats, -0.0 is 0.0, and the entries of a tuple or an array stand one by one.
+        The name of the parameter is None where the magnitude is a number.
         """
         values = {each.name: getattr(self, each.name) for each in fields(self)}
         if self.known is not None:
             values["parameter"] = None
         entries: list[Any] = [self.kind]
         for value in values.values():
-            for entry in value if isinstance(value, tuple) else (value,):
+            value = value.ravel().tolist() if isinstance(value, np.ndarray) else value
+            for entry in value if isinstance(value, tuple | list) else (value,):
                 numeric = isinstance(entry, int | float) and not isinstance(entry, bool)
                 entries.append(float(entry) + 0.0 if numeric else entry)
         return entries

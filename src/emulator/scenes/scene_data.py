@@ -113,6 +113,11 @@ class SceneData:
             for load in self.loads:
                 load.check(self.mesh, prescribed)
             self._check_image()
+            if self.grips is not None and self.loads:
+                raise InputError(
+                    "grips move a specimen; with applied stresses they are not supported: leave "
+                    "out one of the two"
+                )
         except InputError as error:
             raise InputError(f"scene '{self.name}': {error}") from error
 

@@ -4,7 +4,8 @@ Uniaxial, biaxial and shear tests deform the middle of a piece evenly. A specime
 one tetrahedron of corners :math:`0, e_x, e_y, e_z` (mm) for each state of
 :mod:`emulator.scenes.states`, or for each point of a tube's wall in each state
 (:mod:`emulator.scenes.tube`): node k moves by column k of H, and FEM of it is exact. Supports hold
-what is prescribed.
+what is prescribed. A pull P along axis i is a dead force on corner :math:`e_i`, whose work
+:math:`V P H_{ii}` in the volume V of 1/6 mm3 makes it P/6 mN.
 """
 
 from __future__ import annotations
@@ -18,22 +19,24 @@ import numpy as np
 from emulator.core.cells import PROTOCOL, read_cells
 from emulator.core.errors import InputError
 from emulator.geometry.mesh import Mesh
+from emulator.scenes.loads.force import MN_PER_N, Force
 from emulator.scenes.scene import Scene
-from emulator.scenes.states import AXES, States, motion_columns, states
+from emulator.scenes.states import AXES, States, motion_columns, pull_columns, states
 from emulator.scenes.supports.dirichlet import Support
 from emulator.scenes.tube import Tube
 from emulator.scenes.tube import motion_columns as tube_columns
 
 _APART = 2.0  # mm between the tetrahedra of two states
-_CORNER = "corner."  # before the names of the sets that supports hold; other sets are tests
+_VOLUME = 1.0 / 6.0  # mm3, of a tetrahedron
+_CORNER = "corner."  # before the names of the sets that are held or pulled; other sets are tests
 
 
-def body_of(given: States) -> tuple[Mesh, tuple[Support, ...]]:
-    """Return the tetrahedra of states side by side, and the supports that prescribe them.
+def body_of(given: States) -> tuple[Mesh, tuple[Support, ...], tuple[Force, ...]]:
+    """Return the tetrahedra of states side by side, the supports that prescribe them, and pulls.
 
     Sets are ``corner.origin``, ``corner.x`` and so on, and each test by its name.
     """
-    H, free, protocols = given
+    H, free, pulls, protocols = given
     count = len(H)
     side = int(np.ceil(count ** (1.0 / 3.0)))
     places = np.stack(np.unravel_index(np.arange(count), (side, side, side)), axis=1)
@@ -41,7 +44,7 @@ def body_of(given: States) -> tuple[Mesh, tuple[Support, ...]]:
     nodes = (_APART * places[:, None] + corners).reshape(-1, 3)
     elements = np.arange(4 * count).reshape(count, 4)
     sets = {f"{_CORNER}origin": elements[:, 0]}
-    supports = [Support(f"{_CORNER}origin")]
+    supports, forces = [Support(f"{_CORNER}origin")], list[Force]()
     for k, axis in enumerate(AXES):
         name, held = f"{_CORNER}{axis}", np.flatnonzero(~free[:, k])
         sets[name] = elements[:, k + 1]
@@ -49,8 +52,12 @@ def body_of(given: States) -> tuple[Mesh, tuple[Support, ...]]:
         if len(held):
             sets[f"{name}.held"] = elements[held, k + 1]
             supports.append(Support(f"{name}.held", H[held, :, k], components=axis))
+        if len(pulled := np.flatnonzero(pulls[:, k])):
+            sets[f"{name}.pulled"] = elements[pulled, k + 1]
+            along = _VOLUME / MN_PER_N * pulls[pulled, k, None] * np.eye(3)[k]
+            forces.append(Force(f"{name}.pulled", along))
     tests = {name: elements[rows].ravel() for name, rows in protocols.items() if name}
-    return Mesh(nodes, elements, {**tests, **sets}), tuple(supports)
+    return Mesh(nodes, elements, {**tests, **sets}), tuple(supports), tuple(forces)
 
 
 def specimen(
@@ -68,17 +75,18 @@ def specimen(
     ordered : see there.
     tube : the sector of a tube whose motion ``given`` is, see :mod:`emulator.scenes.tube`. With
         several layers, region k of the scene is layer k, from the inside.
-    entries : the fields of a :class:`Scene` besides mesh and supports; fibres and sheets may be one
-        direction (3,).
+    entries : the fields of a :class:`Scene` besides mesh, supports and pulls; fibres and sheets may
+        be one direction (3,).
     """
     if not isinstance(given, States):
         given = states_in(given, tube=tube, ordered=ordered)
-    mesh, supports = body_of(given)
+    mesh, supports, pulls = body_of(given)
     for name in ("fibres", "sheets"):
         if entries.get(name) is not None:
             entries[name] = np.broadcast_to(entries[name], (len(mesh.elements), 3))
     if tube is not None:
         entries |= {"tube": tube, "regions": tube.regions(len(mesh.elements))}
+    entries["loads"] = (*pulls, *entries.get("loads", ()))
     return Scene(mesh=mesh, supports=supports, **{"name": "specimen", **entries})
 
 
@@ -99,6 +107,11 @@ def read_states(path: Path, tube: Tube | None = None) -> States:
     cells = read_cells(path)
     moving = motion_columns if tube is None else tube_columns
     words, rows = moving(cells.words), list(cells.rows)
+    if tube is not None and (pulls := pull_columns(cells.words)):
+        raise InputError(
+            f"data file {path}, column '{min(pulls.values())}': a tube is stretched and inflated, "
+            "not pulled by a given stress; give stretch_axial, pressure and force_axial"
+        )
     if tube is None and not words and (of_tube := tube_columns(cells.words)):
         raise InputError(
             f"data file {path} is of a tube ({', '.join(of_tube)}); give the sector that it opens "
@@ -123,7 +136,7 @@ def is_specimen(scene: Scene) -> bool:
 def states_of(scene: Scene) -> States:
     """Return the states of a specimen's scene, whose supports prescribe them by numbers.
 
-    :class:`InputError` for a scene that is no specimen.
+    :class:`InputError` for a scene that is no specimen, or has loads besides pulls.
     """
     if not is_specimen(scene) or scene.prescribed.per_unit:
         raise InputError(f"scene '{scene.name}' is no specimen: its elements share nodes")
@@ -141,7 +154,19 @@ def states_of(scene: Scene) -> States:
         for name, nodes in scene.mesh.node_sets.items()
         if not name.startswith(_CORNER)
     }
-    return States(H, free, tests or {"": np.arange(len(corners))})
+    return States(H, free, _pulls(scene, corners, free), tests or {"": np.arange(len(corners))})
+
+
+def _pulls(scene: Scene, corners: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """Return the pulls (m, 3) in kPa: known dead forces on free corners (m, 3) along their axes."""
+    forces, pulls = np.zeros(scene.mesh.nodes.shape), np.zeros(free.shape)
+    for load in scene.loads:
+        own = load.dead_forces(scene.discretisation)
+        forces += own.get(None, 0.0)
+        pulls = np.where(free, forces[corners, range(3)], 0.0) / _VOLUME
+        if own.keys() != {None} or np.count_nonzero(forces) > np.count_nonzero(pulls):
+            raise InputError(f"scene '{scene.name}': a specimen has no loads but pulls")
+    return pulls
 
 
 def measured_states(scene: Scene) -> States:
@@ -149,8 +174,7 @@ def measured_states(scene: Scene) -> States:
 
     :class:`InputError` for a scene that is no specimen.
     """
-    H, free, tests = states_of(scene)
+    H, free, pulls, tests = states_of(scene)
     each = 1 if scene.tube is None else scene.tube.size
-    return States(
-        H[::each], free[::each], {name: rows[::each] // each for name, rows in tests.items()}
-    )
+    measured = {name: rows[::each] // each for name, rows in tests.items()}
+    return States(H[::each], free[::each], pulls[::each], measured)

@@ -4,8 +4,8 @@ The machine prescribes some components of the displacement gradient,
 
 .. math:: F = I + H, \qquad H = \partial u / \partial X ,
 
-and across a free direction i nothing pulls, :math:`P_{ii} = 0`. Shears that a table does not
-mention are zero.
+and along a free direction i it pulls with a given first Piola-Kirchhoff stress, or with none,
+:math:`P_{ii} = 0`. Shears that a table does not mention are zero.
 
 ========================  ====================================================
 column                    is
@@ -14,9 +14,11 @@ column                    is
 ``strain_x``              :math:`\lambda - 1`
 ``green_x``               :math:`(\lambda^2 - 1)/2`
 ``shear_xy``              :math:`F_{xy}`, the amount of shear along x of planes normal to y
+``applied_x``              :math:`P_{xx}` in kPa or another unit, which the machine pulls with
 ========================  ====================================================
 
-Strains and shears may be in percent, ``strain_x [%]``. A direction without a value is free.
+Strains and shears may be in percent, ``strain_x [%]``. A direction without a value is free, and so
+is one with ``applied_x``, whose stretch is then a measurement.
 """
 
 from __future__ import annotations
@@ -31,12 +33,17 @@ from emulator.core.cells import PROTOCOL
 from emulator.core.errors import InputError
 
 AXES = "xyz"
-_MOTION = re.compile(r"(stretch|strain|green)_([xyz])|shear_([xyz])([xyz])")
+APPLIED = "applied"
+_MOTION = re.compile(rf"(stretch|strain|green|{APPLIED})_([xyz])|shear_([xyz])([xyz])")
 _WITH_UNIT = re.compile(r"([^\[(]*[^\[( ]) *(?:[\[(] *([^\])]*?) *[\])])?")
 STRETCHES = (0.2, 5.0)
 """Smallest and largest stretch that a table may have."""
 _MOST_SHEAR = 3.0
 _ROUND_OFF = 1e-9
+_BACK = 0.02  # share of a test's largest pull by which a pull may go back, as measured ones do
+
+IN_KPA = {"kPa": 1.0, "Pa": 1e-3, "MPa": 1e3, "mmHg": 0.13332239, "g/cm2": 0.0980665}
+"""Units of columns of stresses in kPa."""
 
 
 class States(NamedTuple):
@@ -44,19 +51,28 @@ class States(NamedTuple):
 
     gradients : the prescribed H = F - I, (m, 3, 3); zero in free directions.
     free : whether the stretch along each axis is free, (m, 3).
+    pulls : the first Piola-Kirchhoff stress along each axis in kPa, (m, 3); zero where nothing
+        pulls, or a stretch is prescribed.
     protocols : the rows (k,) of each test, by its name.
     """
 
     gradients: np.ndarray
     free: np.ndarray
+    pulls: np.ndarray
     protocols: Mapping[str, np.ndarray]
 
     @property
     def paths(self) -> np.ndarray:
-        """The way (m,) of each state from the first of its test, in stretch."""
+        """The way (m,) of each state from the first of its test.
+
+        It is measured in prescribed stretch, plus the pull's way as a share of the test's largest
+        pull. Neither depends on measurements.
+        """
         found = np.zeros(len(self.gradients))
         for rows in self.protocols.values():
             steps = np.linalg.norm(np.diff(self.gradients[rows], axis=0), axis=(1, 2))
+            largest = np.linalg.norm(self.pulls[rows], axis=1).max() or 1.0
+            steps += np.linalg.norm(np.diff(self.pulls[rows], axis=0), axis=1) / largest
             found[rows[1:]] = np.cumsum(steps)
         return found
 
@@ -67,9 +83,32 @@ def with_unit(word: str) -> tuple[str, str]:
     return (found[1], found[2] or "") if found else (word, "")
 
 
+def factor(word: str, unit: str, usual: str, known: Mapping[str, float]) -> float:
+    """Return the factor from a column's unit, ``usual`` where it has none."""
+    plain = unit.replace("²", "2").replace("^", "") or usual
+    if plain not in known:
+        raise InputError(f"column '{word}': unit '{unit}' is unknown; one of {', '.join(known)}")
+    return known[plain]
+
+
 def motion_columns(words: Collection[str]) -> list[str]:
-    """Return the columns that say how a specimen moves."""
+    """Return the columns that say how a specimen moves, or how it is pulled."""
     return [word for word in words if _MOTION.fullmatch(with_unit(word)[0])]
+
+
+def pull_columns(words: Collection[str]) -> dict[str, str]:
+    """Return the column of the pull along each axis that has one."""
+    return _along_axes(words, {APPLIED})
+
+
+def stretch_columns(words: Collection[str]) -> dict[str, str]:
+    """Return the column of the stretch along each axis that has one, in whichever measure."""
+    return _along_axes(words, {"stretch", "strain", "green"})
+
+
+def _along_axes(words: Collection[str], measures: Collection[str]) -> dict[str, str]:
+    found = {word: _MOTION.fullmatch(with_unit(word)[0]) for word in words}
+    return {m[2]: word for word, m in found.items() if m is not None and m[1] in measures}
 
 
 def states(
@@ -88,33 +127,52 @@ def states(
     Raises
     ------
     InputError
-        No column or two of one component, a unit that is no percent, a stretch that is none, a
-        state in which nothing or everything is free, or a test that goes back.
+        No column or two of one component, an unknown unit, a stretch that is none, a state that
+        nothing moves or pulls, or a test that goes back.
+    """
+    H, pulls = components_of(columns)
+    count, diagonal, pulled = len(H), np.eye(3, dtype=bool), ~np.isnan(pulls)
+    free = np.isnan(H[:, range(3), range(3)]) | pulled
+    gradients = np.where(free[:, :, None] & diagonal, 0.0, H)
+    _check(gradients, free, pulled)
+    tests = rows_of([""] * count if protocols is None else protocols)
+    for name, own in tests.items() if ordered else ():
+        _check_path(gradients[own], free[own], pulls[own], own, name)
+    return States(gradients, free, np.nan_to_num(pulls), tests)
+
+
+def components_of(columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return H (m, 3, 3) and the pulls (m, 3) in kPa that columns (m,) have, NaN without a value.
+
+    The stretch along a pull is a measurement, and in H, too. Errors are those of :func:`states`.
     """
     if not columns:
         raise InputError("no column says how the specimen moves: stretch_x, strain_x or shear_xy")
     count = len(next(iter(columns.values())))
-    H = np.full((count, 3, 3), 0.0)
+    H, pulls = np.zeros((count, 3, 3)), np.full((count, 3), np.nan)
     H[:, range(3), range(3)] = np.nan
-    sources: dict[tuple[int, int], str] = {}
+    sources: dict[tuple[int, ...], str] = {}
     for word, values in columns.items():
         name, unit = with_unit(word)
         found = _MOTION.fullmatch(name)
         assert found is not None
         measure, axis, *plane = found.groups()
-        place = tuple(AXES.index(a) for a in (plane if axis is None else (axis, axis)))
+        numbers = np.asarray(values, dtype=float)
+        own = plane if axis is None else [axis] if measure == APPLIED else [axis, axis]
+        place = tuple(AXES.index(a) for a in own)
         if place in sources or (axis is None and place[0] == place[1]):
-            other = sources.get((place[0], place[1]), "a stretch")
+            other = sources.get(place, "a stretch")
             raise InputError(f"column '{word}' says the same as '{other}'; leave one out")
-        sources[place[0], place[1]] = word
-        H[:, place[0], place[1]] = _component(word, measure, unit, np.asarray(values, dtype=float))
-    free = np.isnan(H[:, range(3), range(3)])
-    gradients = np.where(np.isnan(H), 0.0, H)
-    _check(gradients, free, sources)
-    tests = rows_of([""] * count if protocols is None else protocols)
-    for name, own in tests.items() if ordered else ():
-        _check_path(gradients[own], free[own], own, name)
-    return States(gradients, free, tests)
+        sources[place] = word
+        if measure == APPLIED:
+            pulls[:, place[0]] = numbers * factor(word, unit, "kPa", IN_KPA)
+            continue
+        component = H[:, place[0], place[1]] = _component(word, measure, unit, numbers)
+        kind, rest = ("shear", 0.0) if axis is None else ("stretch", 1.0)
+        _check_component(word, rest + component, kind)
+    if np.isinf(pulls).any():
+        raise InputError(f"row {np.argmax(np.isinf(pulls).any(axis=1)) + 1} has an infinite pull")
+    return H, pulls
 
 
 def rows_of(names: Sequence[str]) -> dict[str, np.ndarray]:
@@ -136,23 +194,24 @@ def _component(word: str, measure: str | None, unit: str, values: np.ndarray) ->
     return values - 1.0 if measure == "stretch" else values
 
 
-def _check(H: np.ndarray, free: np.ndarray, sources: Mapping[tuple[int, int], str]) -> None:
+def _check_component(word: str, values: np.ndarray, kind: str) -> None:
+    """Refuse stretches or shears (m,) that no specimen has; NaN passes."""
+    low, high = STRETCHES if kind == "stretch" else (-_MOST_SHEAR, _MOST_SHEAR)
+    bad = np.flatnonzero((values < low) | (values > high))
+    if len(bad):
+        hint = f"is it in percent? call it '{with_unit(word)[0]} [%]'"
+        if "stretch" in word:
+            hint = "a stretch is 1 at rest; a strain goes in strain_x, in percent strain_x [%]"
+        raise InputError(
+            f"row {bad[0] + 1}, column '{word}' is a {kind} of {values[bad[0]]:g}, outside "
+            f"{low:g} to {high:g}: {hint}"
+        )
+
+
+def _check(H: np.ndarray, free: np.ndarray, pulled: np.ndarray) -> None:
     """Refuse states that no specimen has."""
-    for (i, j), word in sources.items():
-        value, held = H[:, i, j] + (i == j), ~free[:, i] | (i != j)
-        low, high = STRETCHES if i == j else (-_MOST_SHEAR, _MOST_SHEAR)
-        bad = np.flatnonzero(((value < low) | (value > high)) & held)
-        if len(bad):
-            hint = f"is it in percent? call it '{with_unit(word)[0]} [%]'"
-            if "stretch" in word:
-                hint = "a stretch is 1 at rest; a strain goes in strain_x, in percent strain_x [%]"
-            kind = "stretch" if i == j else "shear"
-            raise InputError(
-                f"row {bad[0] + 1}, column '{word}' is a {kind} of {value[bad[0]]:g}, outside "
-                f"{low:g} to {high:g}: {hint}"
-            )
     sheared = (np.abs(H) * (1.0 - np.eye(3))).any(axis=(1, 2))
-    loose = np.flatnonzero(free.all(axis=1) & ~sheared)
+    loose = np.flatnonzero(free.all(axis=1) & ~sheared & ~pulled.any(axis=1))
     if len(loose):
         raise InputError(f"row {loose[0] + 1} has no stretch and no shear; give one, or drop it")
     J = np.linalg.det(np.eye(3) + H)
@@ -161,20 +220,25 @@ def _check(H: np.ndarray, free: np.ndarray, sources: Mapping[tuple[int, int], st
         raise InputError(f"row {closed[0] + 1} turns the specimen inside out")
 
 
-def _check_path(H: np.ndarray, free: np.ndarray, rows: np.ndarray, name: str) -> None:
-    """Refuse a test in which a stretch is missing in some rows.
+def _check_path(
+    H: np.ndarray, free: np.ndarray, pulls: np.ndarray, rows: np.ndarray, name: str
+) -> None:
+    """Refuse a test in which a stretch or a pull is missing in some rows.
 
     Or one that goes back: unloading, or a second test under the same name.
     """
     test = f" of '{name}'" if name else ""
-    for axis, own in zip(AXES, free.T, strict=True):
-        if own.any() and not own.all():
-            raise InputError(
-                f"row {rows[np.argmax(own)] + 1}{test} has no stretch along {axis}, others have: "
-                "give it, leave the row out, or name another test in a column 'protocol'"
-            )
-    away = np.linalg.norm(np.where(free[:, :, None] & np.eye(3, dtype=bool), 0.0, H), axis=(1, 2))
-    back = np.flatnonzero(np.diff(away) < -_ROUND_OFF)
+    for what, missing in (("pull", np.isnan(pulls)), ("stretch", free)):
+        for axis, own in zip(AXES, missing.T, strict=True):
+            if own.any() and not own.all():
+                raise InputError(
+                    f"row {rows[np.argmax(own)] + 1}{test} has no {what} along {axis}, others "
+                    "have: give it, leave the row out, or name another test in a column 'protocol'"
+                )
+    away = np.linalg.norm(H, axis=(1, 2))
+    pull = np.linalg.norm(np.nan_to_num(pulls), axis=1)
+    fell = (np.diff(away) < -_ROUND_OFF) | (np.diff(pull) < -_BACK * pull.max())
+    back = np.flatnonzero(fell)
     if len(back):
         raise InputError(
             f"row {rows[back[0] + 1] + 1}{test} is nearer to rest than the one before: unloading "

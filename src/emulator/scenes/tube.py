@@ -155,7 +155,7 @@ class Tube:
             name: (own[:, None] * self.size + np.arange(self.size)).ravel()
             for name, own in tests.items()
         }
-        return States(H, free, points)
+        return States(H, free, np.zeros((count, 3)), points)
 
     def _motion(self, columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Return the axial stretches (m,), and the inner radii (m,) in mm."""

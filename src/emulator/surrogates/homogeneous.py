@@ -2,18 +2,20 @@ r"""Specimens without a mesh: the equilibrium of every homogeneous state by itse
 
 Free stretches d minimise the energy density, compressible or not,
 
-.. math:: \min_d W(H(d)) \qquad\text{or}\qquad \min_d W(H(d)) \;\text{ with }\; \det F(d) = 1 ,
+.. math::
+    \min_d W(H(d)) - \sum_i P_i H_{ii}(d) \qquad\text{or}\qquad
+    \text{the same with }\; \det F(d) = 1 ,
 
-by Newton's method from the stretches that keep the volume. Its steps go down the energy and keep
-every stretch above a fifth of its value. An incompressible specimen needs no pressure: the last
-free stretch follows from the others,
+where a test under load control pulls with :math:`P_i`, by Newton's method from the stretches that
+keep the volume. Its steps go down the energy and keep every stretch above a fifth of its value. An
+incompressible specimen needs no pressure: the last free stretch follows from the others,
 
 .. math:: F_{ll} = (1 - \det F|_{F_{ll} = 0}) / \operatorname{cof}(F)_{ll} ,
 
-which is the condition that nothing pulls along it. First derivatives are those of the equilibrium,
-by the implicit function theorem. All states are one batch, and so are all theta
-under ``vmap``. FEM of the same scene gives the same numbers for a compressible law; for an
-incompressible map it tells what the law's bulk modulus changes.
+and its pull, if it has one, does work like the others. First derivatives are those of the
+equilibrium, by the implicit function theorem. All states are one batch, and so are all theta under
+``vmap``. FEM of the same scene gives the same numbers for a compressible law; for an incompressible
+map it tells what the law's bulk modulus changes.
 """
 
 from __future__ import annotations
@@ -54,7 +56,8 @@ class Homogeneous:
     Raises
     ------
     InputError
-        A scene that is no specimen or has loads; an incompressible state without a free direction.
+        A scene that is no specimen or has loads besides pulls; an incompressible state without a
+        free direction.
     """
 
     scene: Scene
@@ -63,8 +66,6 @@ class Homogeneous:
 
     def __post_init__(self) -> None:
         closed = np.flatnonzero(~self.states.free.any(axis=1))  # refuses what is no specimen
-        if self.scene.loads:
-            raise InputError(f"scene '{self.scene.name}': a specimen has no loads")
         if self.incompressible and len(closed):
             raise InputError(
                 f"state {closed[0] + 1} of '{self.scene.name}' has no free direction: an "
@@ -101,7 +102,10 @@ class Homogeneous:
         point = Point(point_energy(self.scene, theta), stress_and_moduli(self.scene, theta))
         tissue = jax.tree.map(lambda each: each[elements, 0], self.scene.tissue_at(theta))
         settled, converged = jax.vmap(partial(equilibrium, point))(
-            jnp.asarray(self.states.gradients[elements]), *self._free(elements), tissue
+            jnp.asarray(self.states.gradients[elements]),
+            jnp.asarray(self.states.pulls[elements]),
+            *self._free(elements),
+            tissue,
         )
         columns = jnp.swapaxes(settled, 1, 2)[rows, np.maximum(corners - 1, 0)]
         u = jnp.where((corners > 0)[:, None], columns, 0.0)
@@ -110,9 +114,12 @@ class Homogeneous:
     def _free(self, elements: np.ndarray) -> tuple[jax.Array, jax.Array]:
         """Return the axes (e, u) of the free stretches, 3 for none, and that of the last, (e,).
 
-        The last one follows from the others where the specimen is incompressible, else it is 3.
+        The last one follows from the others where the specimen is incompressible, else it is 3. No
+        pull is along it if there is another free direction.
         """
-        axes = np.sort(np.where(self.states.free[elements], np.arange(3), 3), axis=1)
+        free, pulls = self.states.free[elements], self.states.pulls[elements]
+        order = np.argsort(2 * ~free + 1 * (pulls == 0.0), axis=1, kind="stable")
+        axes = np.where(np.take_along_axis(free, order, axis=1), order, 3)
         count = (axes < 3).sum(axis=1)
         last = np.full(len(elements), 3)
         if self.incompressible:
@@ -139,18 +146,20 @@ def homogeneous_stresses(
 ) -> tuple[jax.Array, jax.Array]:
     r"""Return gradients H and first Piola-Kirchhoff stresses P in kPa of the states, (m, 3, 3).
 
-    P is the law's stress less a pressure, at which nothing pulls along the last free direction l,
+    P is the law's stress less a pressure, at which the last free direction l has its pull
+    :math:`P_l`, zero where nothing pulls,
 
     .. math::
         P = \frac{\partial W}{\partial F} - p \operatorname{cof} F, \qquad
-        p = \frac{\partial W}{\partial F_{ll}} \Big/ \operatorname{cof}(F)_{ll} .
+        p = \Big(\frac{\partial W}{\partial F_{ll}} - P_l\Big) \Big/ \operatorname{cof}(F)_{ll} .
 
     It vanishes where a compressible specimen is in equilibrium, and is the unknown of an
     incompressible one.
 
     u : the displacement (n, 3) mm of all nodes of the specimen ``scene``.
     """
-    elements, free = scene.mesh.elements, states_of(scene).free
+    elements, given = scene.mesh.elements, states_of(scene)
+    free = given.free
     H = jnp.swapaxes(u[elements[:, 1:]] - u[elements[:, :1]], 1, 2)
     tissue = jax.tree.map(lambda each: each[:, 0], scene.tissue_at(theta))
     of_law = jax.vmap(jax.grad(point_energy(scene, theta)))(H, tissue)
@@ -158,8 +167,9 @@ def homogeneous_stresses(
     cofactors = jax.vmap(cofactor)(H + jnp.eye(3))
     is_last = jnp.asarray(last[:, None] == np.arange(3))
     along = jnp.where(is_last, jnp.diagonal(cofactors, axis1=1, axis2=2), 1.0)
-    pulls = jnp.where(is_last, jnp.diagonal(of_law, axis1=1, axis2=2) / along, 0.0)
-    return H, of_law - pulls.sum(axis=1)[:, None, None] * cofactors
+    excess = jnp.diagonal(of_law, axis1=1, axis2=2) - given.pulls
+    pressure = jnp.sum(jnp.where(is_last, excess / along, 0.0), axis=1)
+    return H, of_law - pressure[:, None, None] * cofactors
 
 
 class Point(NamedTuple):
@@ -174,13 +184,14 @@ class Point(NamedTuple):
 
 
 def equilibrium(
-    point: Point, H: jax.Array, axes: jax.Array, last: jax.Array, tissue: Any
+    point: Point, H: jax.Array, pulls: jax.Array, axes: jax.Array, last: jax.Array, tissue: Any
 ) -> tuple[jax.Array, jax.Array]:
     """Return the displacement gradient (3, 3) of one state, and whether it is an equilibrium.
 
     Parameters
     ----------
     H : the prescribed gradient (3, 3), zero in free directions.
+    pulls : the first Piola-Kirchhoff stress along each axis in kPa, (3,).
     axes : the axes (u,) of the stretches that minimise the energy; 3 for none.
     last : the axis of the stretch that keeps the volume; 3 for none.
     """
@@ -202,17 +213,20 @@ def equilibrium(
 
     def linearised(d: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Return energy, slope (u,) and stiffness (u, u) in the own stretches."""
-        stress, moduli = point.moduli(gradient(d), tissue)
+        H = gradient(d)
+        stress, moduli = point.moduli(H, tissue)
+        stress = stress - jnp.diag(pulls)
         along, bending = slope_of(d), jax.jacfwd(slope_of)(d)
         stiffness = jnp.einsum("ija,ijkl,klb->ab", along, moduli, along)
         stiffness += jnp.einsum("ij,ijab->ab", stress, bending)
         stiffness = jnp.where(own[:, None] & own, stiffness, jnp.diag(jnp.where(own, 0.0, 1.0)))
         slope = jnp.where(own, jnp.einsum("ij,ija->a", stress, along), 0.0)
-        return point.energy(gradient(d), tissue), slope, stiffness
+        work = jnp.vdot(pulls, jnp.diagonal(H))
+        return point.energy(H, tissue) - work, slope, stiffness
 
     found = jax.lax.stop_gradient(_minimised(linearised, start))
     # One more step, whose stiffness is a constant, has the derivative of the equilibrium.
-    stress = jax.grad(point.energy)(gradient(found.d), tissue)
+    stress = jax.grad(point.energy)(gradient(found.d), tissue) - jnp.diag(pulls)
     slope = jnp.where(own, jnp.einsum("ij,ija->a", stress, slope_of(found.d)), 0.0)
     step = _solved(found.stiffness, slope)
     converged = found.converged & jnp.all(jnp.isfinite(step))

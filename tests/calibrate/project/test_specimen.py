@@ -197,3 +197,48 @@ def test_bad_grips_get_one_line(gripped, capsys, old, new, words):
 def test_a_folder_is_no_file_of_grips(gripped, capsys):
     assert main(["train", "scene.toml", "--out", "grips"]) == 2
     assert "NAME.safetensors" in capsys.readouterr().err
+
+
+def load_control():
+    """A test under load control and one under stretch control, of the law of ``table``."""
+    rows = ["protocol,applied_x,stretch_x,stretch_y,stress_x [kPa]"]
+    s = np.linspace(1.0, 1.2, 5)
+    pull = A * np.exp(B * (s**2 + 2.0 / s - 3.0)) * (s - s**-2.0)
+    rows += [f"pull,{pull[k]:.12g},{s[k] + 1e-3 * (-1) ** k:.12g},," for k in range(5)]
+    stress = A * np.exp(B * (s**2 + s**-2.0 - 2.0)) * (s - s**-3.0)
+    rows += [f"strip,,{s[k]:.12g},1,{stress[k] + 0.1 * (-1) ** k:.12g}" for k in range(5)]
+    return "\n".join(rows) + "\n"
+
+
+def test_load_control_has_its_files_by_one_command(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "test.csv").write_text(load_control())
+    words = ["--law", "holzapfel_ogden_isotropic"]
+    assert main(["init", "test.csv", *words, "--json"]) == 0
+    notes = " ".join(json.loads(capsys.readouterr().out)["notes"])
+    for told in ("10 states in 2 tests", "stretch reaches 1.2", "0.3 of a test's largest pull",
+                 "applied_x without a unit: kPa"):  # fmt: skip
+        assert told in notes
+    assert "[grips]" not in (tmp_path / "test_scene.toml").read_text()
+    problem = read_experiment(tmp_path / "test.toml")
+    assert set(problem.run.noise) == {"stress", "stretch"}
+    scene = read_scene(tmp_path / "test_scene.toml")
+    assert scene.space.theta({"a": A, "b": B}, "truth is in the ranges").shape == (2,)
+
+
+@pytest.mark.slow
+def test_load_control_has_the_laws_parameters(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "test.csv").write_text(load_control())
+    assert main(["init", "test.csv", "--law", "holzapfel_ogden_isotropic"]) == 0
+    capsys.readouterr()
+    assert main(["infer", "test.toml", "--out", "run", "--no-certify", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["parameters"]
+    for name, truth in (("a", A), ("b", B)):
+        assert abs(rows[name]["mean"] - truth) < 4.0 * rows[name]["sd"]
+
+
+def test_a_test_without_any_stretch_is_refused(tmp_path):
+    (tmp_path / "test.csv").write_text("applied_x,stretch_x\n0,1\n2,1\n")
+    with pytest.raises(InputError, match="each stretch is 1"):
+        draft_specimen(tmp_path / "test.csv", tmp_path / "test.toml")

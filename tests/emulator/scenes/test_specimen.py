@@ -6,6 +6,7 @@ import pytest
 import emulator as em
 from emulator.core.errors import InputError
 from emulator.scenes.file import read_scene
+from emulator.scenes.grips import Grips
 from emulator.scenes.specimen import read_states, specimen, states_of
 from emulator.scenes.states import states, with_unit
 
@@ -61,6 +62,16 @@ def test_columns_have_units(word, expected):
             "row 3 has no stretch along y, others have",
         ),
         ({"stretch_x": [1.0, 1.2, 1.1]}, "row 3 is nearer to rest than the one before: unloading"),
+        ({"applied_x": [0.0, 2.0, 1.0]}, "row 3 is nearer to rest than the one before: unloading"),
+        ({"applied_x [psi]": [0.0, 2.0]}, "column 'applied_x [psi]': unit 'psi' is unknown"),
+        ({"applied_x": [0.0, 2.0], "applied_x [kPa]": [0.0, 2.0]}, "same as 'applied_x'"),
+        ({"applied_x": [0.0, np.inf]}, "row 2 has an infinite pull"),
+        (
+            {"applied_x": [0.0, NAN, 2.0], "stretch_x": [1.0, 1.1, 1.2]},
+            "row 2 has no pull along x, others have",
+        ),
+        ({"applied_x": [0.0, NAN], "applied_y": [0.0, 1.0]}, "row 2 has no pull along x"),
+        ({"applied_x": [0.0, 2.0], "stretch_x": [100.0, 110.0]}, "a stretch is 1 at rest"),
     ],
 )
 def test_tables_that_no_specimen_makes_are_refused(columns, message):
@@ -105,6 +116,55 @@ def test_a_scene_has_the_states_that_made_it():
         states_of(em.find_scene("twisting_cube"))
 
 
+PULLED = {
+    "applied_x [MPa]": np.array([0.0, 0.01, NAN, NAN, -0.002]),
+    "applied_y": np.array([0.0, 3.0, NAN, NAN, NAN]),
+    "stretch_x": np.array([1.0, 1.1, 1.0, 1.2, NAN]),
+}
+
+
+def test_a_scene_has_the_pulls_that_made_it():
+    given = states(PULLED, ["pulled", "pulled", "moved", "moved", "pressed"])
+    expected = [[0.0, 0.0, 0.0], [10.0, 3.0, 0.0], [0.0] * 3, [0.0] * 3, [-2.0, 0.0, 0.0]]
+    np.testing.assert_allclose(given.pulls, expected)
+    np.testing.assert_array_equal(given.free[:, 0], [True, True, False, False, True])
+    assert not given.gradients[:2].any()  # what is measured is not prescribed
+    np.testing.assert_allclose(given.paths, [0.0, 1.0, 0.0, 0.2, 0.0])
+    scene = of_law(given)
+    np.testing.assert_allclose(states_of(scene).pulls, given.pulls, rtol=1e-15)
+    np.testing.assert_array_equal(states_of(scene).free, given.free)
+    other = states(PULLED | {"applied_y": np.array([0.0, 3.1, NAN, NAN, NAN])}, ordered=False)
+    assert of_law(other).fingerprint != scene.fingerprint
+    assert of_law(given).fingerprint == scene.fingerprint
+
+
+def test_a_specimen_has_no_loads_but_pulls():
+    given = states({"applied_x": np.array([0.0, 2.0])})
+    for load in (
+        em.loads.Gravity(),
+        em.loads.Force("corner.x.pulled", (1.0, 0.0, 0.0), amount="share"),
+        em.loads.Force("corner.x.pulled", (0.0, 1.0, 0.0)),
+    ):
+        extra = (em.Parameter("share", "", 0.0, 1.0),) if load.quantities else ()
+        scene = specimen(
+            given,
+            law=em.find_law("neo_hookean"),
+            parameters=(em.Parameter("mu", "kPa", 5.0, 20.0), *extra),
+            constants={"lam": 50.0},
+            loads=(load,),
+        )
+        with pytest.raises(InputError, match="a specimen has no loads but pulls"):
+            em.homogeneous(scene)
+    with pytest.raises(InputError, match="grips move a specimen"):
+        of_law(given, grips=Grips((8.0, 4.0, 2.0)))
+
+
+def test_a_tube_is_not_pulled(tmp_path):
+    (tmp_path / "table.csv").write_text("outer_radius,stretch_axial,applied_y\n5.5,1.3,2.0\n")
+    with pytest.raises(InputError, match="column 'applied_y': a tube is stretched and inflated"):
+        read_states(tmp_path / "table.csv", em.Tube(4.6, (0.9,)))
+
+
 SCENE = """
 law = "neo_hookean"
 specimen = "table.csv"
@@ -131,6 +191,12 @@ def test_a_scene_file_names_the_table(tmp_path):
     (tmp_path / "table.csv").write_text("protocol,stretch_x,stress_x\na,1.0,0\n,1.1,1\n")
     (tmp_path / "scene.toml").write_text(SCENE)
     with pytest.raises(InputError, match=r"row 2, column 'protocol' is empty"):
+        read_scene(tmp_path / "scene.toml")
+    (tmp_path / "table.csv").write_text("applied_x [Pa],strain_x\n0,0\n2000,0.1\n")
+    (tmp_path / "scene.toml").write_text(SCENE)
+    np.testing.assert_allclose(states_of(read_scene(tmp_path / "scene.toml")).pulls[1], [2, 0, 0])
+    (tmp_path / "scene.toml").write_text("grips = {size = [8.0, 4.0, 2.0]}\n" + SCENE)
+    with pytest.raises(InputError, match="grips move a specimen"):
         read_scene(tmp_path / "scene.toml")
     (tmp_path / "table.csv").write_text("stretch_x,stress_x\n1.0,0\n112,1\n")
     (tmp_path / "scene.toml").write_text(SCENE)

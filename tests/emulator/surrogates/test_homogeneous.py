@@ -8,9 +8,9 @@ import pytest
 import emulator as em
 from emulator.core.errors import InputError
 from emulator.scenes.scene import all_nodes
-from emulator.scenes.specimen import specimen
+from emulator.scenes.specimen import specimen, states_of
 from emulator.scenes.states import states
-from emulator.surrogates.homogeneous import Homogeneous
+from emulator.surrogates.homogeneous import Homogeneous, homogeneous_stresses
 
 NAN = np.nan
 PULL = np.linspace(1.0, 1.2, 4)
@@ -24,13 +24,24 @@ GIVEN = states(
     ["uniaxial"] * 4 + ["biaxial"] * 4 + ["xz"] * 4 + ["yx"] * 4,
 )
 THETA = jnp.array([1.0, 6.0])
+FORCE = np.linspace(0.0, 20.0, 4)
+PULLED = states(
+    {
+        "applied_x": np.concatenate([FORCE, FORCE, FORCE, np.full(4, NAN)]),
+        "applied_y": np.concatenate([np.full(4, NAN), 0.5 * FORCE, np.full(8, NAN)]),
+        "applied_z": np.concatenate([np.full(12, NAN), 0.2 * FORCE]),
+        "stretch_y": np.concatenate([np.full(8, NAN), np.ones(4), np.full(4, NAN)]),
+        "shear_xz": np.concatenate([np.zeros(12), PULL - 0.99]),
+    },
+    ["uniaxial"] * 4 + ["biaxial"] * 4 + ["strip"] * 4 + ["xz"] * 4,
+)
 
 
-@pytest.fixture(scope="module")
-def tissue():
-    """Fibres at 30 degrees from x in the plane of x and y."""
+@pytest.fixture(scope="module", params=[GIVEN, PULLED], ids=["moved", "pulled"])
+def tissue(request):
+    """Fibres at 30 degrees from x in the plane of x and y, under stretch or load control."""
     return specimen(
-        GIVEN,
+        request.param,
         law=em.find_law("holzapfel_ogden"),
         parameters=(em.Parameter("a", "kPa", 0.2, 2.0), em.Parameter("b_f", "", 1.0, 10.0)),
         constants={"b": 3.0, "a_f": 5.0, "kappa": 40.0},
@@ -73,7 +84,7 @@ def test_an_incompressible_specimen_keeps_its_volume(tissue):
     np.testing.assert_allclose(np.linalg.det(F), 1.0, atol=1e-14)
     # The limit of a law whose volume hardly changes.
     stiff = specimen(
-        GIVEN, law=tissue.law, parameters=tissue.parameters, fibres=tissue.fibres,
+        states_of(tissue), law=tissue.law, parameters=tissue.parameters, fibres=tissue.fibres,
         constants={**tissue.constants, "kappa": 1e6},
     )  # fmt: skip
     np.testing.assert_allclose(Homogeneous(stiff, forward.nodes)(THETA), u, atol=1e-4)
@@ -87,6 +98,48 @@ def test_many_theta_and_some_nodes(tissue, compressible):
         np.testing.assert_allclose(compressible(theta), u, atol=1e-12)
     nodes = np.array([50, 3, 17])
     np.testing.assert_allclose(compressible.at(nodes)(THETA), batch.displacement[0, nodes])
+
+
+@pytest.mark.parametrize("incompressible", [False, True])
+def test_stresses_are_the_pulls_and_stretches_give_them_back(incompressible):
+    """A test under load control, and the same states prescribed by their stretches."""
+    law, parameters = em.find_law("holzapfel_ogden"), (em.Parameter("a", "kPa", 0.2, 2.0),)
+    words = {"constants": {"b": 3.0, "a_f": 5.0, "b_f": 6.0, "kappa": 40.0}, "fibres": [1, 0, 0]}
+    pulled = specimen({"applied_x": FORCE, "applied_y": 0.5 * FORCE}, law=law,
+                      parameters=parameters, **words)  # fmt: skip
+    theta = THETA[:1]
+    u = em.homogeneous(pulled, incompressible=incompressible)(theta)
+    H, P = homogeneous_stresses(pulled, u, theta)
+    expected = FORCE[:, None] * np.array([1.0, 0.5, 0.0])
+    np.testing.assert_allclose(np.diagonal(P, axis1=1, axis2=2), expected, atol=1e-10)
+    stretches = {f"strain_{a}": np.array(H[:, k, k]) for k, a in enumerate("xy")}
+    moved = specimen(stretches, ordered=False, law=law, parameters=parameters, **words)
+    again = em.homogeneous(moved, incompressible=incompressible)(theta)
+    _, P = homogeneous_stresses(moved, again, theta)
+    np.testing.assert_allclose(np.diagonal(P, axis1=1, axis2=2), expected, atol=1e-10)
+
+
+@pytest.mark.parametrize("axis", [0, 2])
+def test_large_pulls_of_an_exponential(axis):
+    """In closed form to a stretch of 1.3 at b = 30, and at the corners of a box around it."""
+    stretch, a, b = np.linspace(1.0, 1.3, 7), 1.0, 30.0
+    pull = a * np.exp(b * (stretch**2 + 2.0 / stretch - 3.0)) * (stretch - stretch**-2.0)
+    scene = specimen(
+        {f"applied_{'xyz'[axis]}": pull},
+        law=em.find_law("holzapfel_ogden_isotropic"),
+        parameters=(em.Parameter("a", "kPa", 1e-3, 100.0), em.Parameter("b", "", 0.1, 80.0)),
+        constants={"kappa": 1000.0},
+    )
+    thetas = jnp.array([[a, b], *([x, y] for x in (1e-3, 100.0) for y in (0.1, 80.0))])
+    for incompressible in (True, False):
+        forward = em.homogeneous(scene, incompressible=incompressible).evaluate
+        found = jax.jit(jax.vmap(forward))(thetas)
+        assert found.valid.all()
+        assert np.isfinite(found.displacement).all()
+        if incompressible:
+            along = 1.0 + found.displacement[0, scene.mesh.elements[:, 1 + axis], axis]
+            np.testing.assert_allclose(along, stretch, atol=1e-12)
+    assert not bool(jax.jit(forward)(jnp.array([jnp.nan, 1.0])).valid)
 
 
 def test_hard_states_are_found_or_refused():

@@ -17,21 +17,22 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import Discretisation
-from emulator.geometry.mesh import EDGES, Mesh
-from emulator.scenes.part import Load, LocalForce, Values
+from emulator.geometry.mesh import EDGES, Mesh, frozen_array
+from emulator.scenes.part import Load, LocalForce, Prescribed, Values
 from emulator.scenes.tissue import Fibres
 
 MN_PER_N = 1e3
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Force(Load):
     """A force in N that keeps its direction, spread over a node set.
 
     Parameters
     ----------
     node_set : one node, the nodes of an edge, or any others.
-    resultant : three components in N; with ``amount``, per unit of that parameter.
+    resultant : three components in N, or in Python (k, 3), one row a node of the set; with
+        ``amount``, per unit of that parameter.
     amount : name of a parameter that multiplies the force; without it, the force is known. A range
         around 1 makes it a force known to some percent.
     """
@@ -39,19 +40,28 @@ class Force(Load):
     kind: ClassVar[str] = "force"
 
     node_set: str
-    resultant: tuple[float, float, float]
+    resultant: np.ndarray
     amount: str | None = None
 
     def __post_init__(self) -> None:
-        if len(self.resultant) != 3 or not np.isfinite(self.resultant).all():
+        object.__setattr__(self, "resultant", force := frozen_array(self.resultant))
+        if force.shape[-1:] != (3,) or force.ndim > 2 or not np.isfinite(force).all():
             raise InputError(
-                f"force on '{self.node_set}' is {self.resultant}; give 3 finite numbers in N"
+                f"force on '{self.node_set}' is {force.tolist()}; give 3 finite numbers in N"
             )
 
     @property
     def simpler(self) -> tuple[str, None]:
         """No force."""
         return f"force on '{self.node_set}'", None
+
+    @override
+    def check(self, mesh: Mesh, prescribed: Prescribed) -> None:
+        count = len(mesh.node_set(self.node_set))
+        if self.resultant.ndim == 2 and len(self.resultant) != count:
+            raise InputError(
+                f"force on '{self.node_set}' has {len(self.resultant)} rows for {count} nodes"
+            )
 
     @override
     def dead_forces(self, grid: Discretisation) -> Mapping[str | None, np.ndarray]:
@@ -76,9 +86,12 @@ class Force(Load):
         return (LocalForce(nodes[:, None], share, force),)
 
     def _spread(self, mesh: Mesh) -> np.ndarray:
-        return shares(mesh, mesh.node_set(self.node_set))[:, None] * (
-            MN_PER_N * np.asarray(self.resultant, dtype=float)
-        )
+        nodes = mesh.node_set(self.node_set)
+        if self.resultant.ndim == 1:
+            return MN_PER_N * shares(mesh, nodes)[:, None] * self.resultant
+        forces = np.zeros(mesh.nodes.shape)
+        forces[nodes] = MN_PER_N * self.resultant
+        return forces
 
 
 def edges_between(mesh: Mesh, nodes: np.ndarray) -> np.ndarray:

@@ -48,6 +48,20 @@ def test_a_point_carries_all_of_it(scene):
     assert np.abs(force).sum() == 200.0
 
 
+def test_each_node_may_have_its_own(scene):
+    own = np.array([[0.0, 0.1, 0.0], [0.3, 0.0, 0.0]])
+    nodes = scene.mesh.node_set("edge")[:2]
+    mesh = replace(scene.mesh, node_sets={**scene.mesh.node_sets, "two": nodes})
+    pulled = replace(scene, mesh=mesh, loads=(Force("two", own),))
+    force = dead_force(pulled).constant
+    np.testing.assert_array_equal(force[nodes], 1e3 * own)
+    assert np.abs(force).sum() == 400.0
+    other = replace(scene, mesh=mesh, loads=(Force("two", own[::-1]),))
+    assert other.fingerprint != pulled.fingerprint
+    with pytest.raises(InputError, match="has 3 rows for 2 nodes"):
+        replace(scene, mesh=mesh, loads=(Force("two", np.zeros((3, 3))),))
+
+
 def test_nodes_apart_share_alike(scene):
     apart = np.array([0, len(scene.mesh.nodes) // 2])
     found = shares(scene.mesh, apart)
