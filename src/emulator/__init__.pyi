@@ -12,6 +12,7 @@ from .fem.unloading import Unloaded, Unloader, unload
 from .geometry import generators
 from .geometry.facets import Cavity
 from .geometry.fibres import wall_depth
+from .geometry.heart import mesh_heart
 from .geometry.io import Body, read_body, read_mesh, write_mesh, write_solution
 from .geometry.mesh import Mesh, boundary_facets
 from .geometry.side_by_side import Bodies, side_by_side
@@ -76,6 +77,7 @@ __all__ = [
     "load",
     "loads",
     "mesh_error",
+    "mesh_heart",
     "mesh_wall",
     "potential_energy",
     "read_body",

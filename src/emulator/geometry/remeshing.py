@@ -255,8 +255,8 @@ class DiscMap:
         if not abs(left - 1.0) < _ROUGH:
             raise Unmeshable(
                 f"{self.surface.name}: even triangles with edges of {size:.3g} mm miss "
-                f"{100.0 * abs(left - 1.0):.0f} % of what it encloses; its openings are narrow, the "
-                f"longest rim being of {self.rims[0].length:.3g} mm"
+                f"{100.0 * abs(left - 1.0):.0f} % of what it encloses; its openings are narrow, "
+                f"the longest rim being of {self.rims[0].length:.3g} mm"
             )
         return Remeshed(Surface(self.surface.name, points, rows), places, tuple(turns))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -110,8 +110,11 @@ def farthest(*points: np.ndarray) -> float:
 
 
 def surface_in_mm(source: str | Path | Surface, name: str, unit: str) -> Surface:
-    """Return a surface, or that of a file in ``unit``, which a heart's may be by its size."""
-    surface = source if isinstance(source, Surface) else read_surface(source, name, UNITS[unit])
+    """Return a surface under ``name``, or that of a file in ``unit``, of a heart's size."""
+    if isinstance(source, Surface):
+        surface = replace(source, name=name)
+    else:
+        surface = read_surface(source, name, UNITS[unit])
     if not _EXTENTS[0] <= surface.extent <= _EXTENTS[1]:
         raise InputError(
             f"{name}: it is {surface.extent:.3g} mm from corner to corner, lengths being taken as "

@@ -177,7 +177,9 @@ def test_the_command_draws_and_what_it_wrote_is_solved(rough, tmp_path, capsys):
         "--out", out, "--picture", picture,
     )  # fmt: skip
     assert code == 0
-    assert told["cavities"]["endocardium"]["mesh"] == pytest.approx(HUMAN.cavity_volume / 1000.0, rel=0.02)
+    assert told["cavities"]["endocardium"]["mesh"] == pytest.approx(
+        HUMAN.cavity_volume / 1000.0, rel=0.02
+    )
     assert picture.stat().st_size > 10_000
     scene = draft_scene(out, tmp_path / "lv.toml").scene
     assert Simulator(scene).solve(scene.centre).converged
