@@ -42,6 +42,7 @@ _ITERATIONS = 300  # an exponent falls by about 1 in each, far away
 _CONVERGED = 1e-9  # step, of a stretch; the next one would be its square
 _ARMIJO = 1e-4
 _LEAST = 0.2  # share of a stretch that a step leaves
+_GUESSES = np.concatenate([[0.0], np.geomspace(0.01, 0.9, 20)])  # strains along a pull
 _SHORT = 1e-6  # steps that round-off in the energy may not refuse
 _FLAT = 1e-10  # least pivot, relative to the stiffness
 
@@ -101,7 +102,8 @@ class Homogeneous:
         elements, rows, corners = self._places
         point = Point(point_energy(self.scene, theta), stress_and_moduli(self.scene, theta))
         tissue = jax.tree.map(lambda each: each[elements, 0], self.scene.tissue_at(theta))
-        settled, converged = jax.vmap(partial(equilibrium, point))(
+        guesses = _GUESSES if self.states.pulls.any() else _GUESSES[:1]
+        settled, converged = jax.vmap(partial(equilibrium, point, guesses))(
             jnp.asarray(self.states.gradients[elements]),
             jnp.asarray(self.states.pulls[elements]),
             *self._free(elements),
@@ -184,12 +186,19 @@ class Point(NamedTuple):
 
 
 def equilibrium(
-    point: Point, H: jax.Array, pulls: jax.Array, axes: jax.Array, last: jax.Array, tissue: Any
+    point: Point,
+    guesses: np.ndarray,
+    H: jax.Array,
+    pulls: jax.Array,
+    axes: jax.Array,
+    last: jax.Array,
+    tissue: Any,
 ) -> tuple[jax.Array, jax.Array]:
     """Return the displacement gradient (3, 3) of one state, and whether it is an equilibrium.
 
     Parameters
     ----------
+    guesses : strains (g,) along the pulls, of which the one of least potential is the start.
     H : the prescribed gradient (3, 3), zero in free directions.
     pulls : the first Piola-Kirchhoff stress along each axis in kPa, (3,).
     axes : the axes (u,) of the stretches that minimise the energy; 3 for none.
@@ -211,6 +220,10 @@ def equilibrium(
         return gradient(start), jnp.array(True)
     slope_of = jax.jacfwd(gradient)  # (3, 3, u)
 
+    def potential(d: jax.Array) -> jax.Array:
+        H = gradient(d)
+        return point.energy(H, tissue) - jnp.vdot(pulls, jnp.diagonal(H))
+
     def linearised(d: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Return energy, slope (u,) and stiffness (u, u) in the own stretches."""
         H = gradient(d)
@@ -221,9 +234,14 @@ def equilibrium(
         stiffness += jnp.einsum("ij,ijab->ab", stress, bending)
         stiffness = jnp.where(own[:, None] & own, stiffness, jnp.diag(jnp.where(own, 0.0, 1.0)))
         slope = jnp.where(own, jnp.einsum("ij,ija->a", stress, along), 0.0)
-        work = jnp.vdot(pulls, jnp.diagonal(H))
-        return point.energy(H, tissue) - work, slope, stiffness
+        return potential(d), slope, stiffness
 
+    # Exponential laws overshoot in strain: a pull's equilibrium is looked for near the best guess.
+    along = jnp.where(own, jnp.append(pulls, 0.0)[jnp.minimum(axes, 3)], 0.0)
+    along = along / jnp.maximum(jnp.max(jnp.abs(along)), jnp.finfo(along.dtype).tiny)
+    guesses = start + (1.0 + start) * jnp.asarray(guesses)[:, None] * along
+    energies = jax.vmap(potential)(guesses)
+    start = guesses[jnp.argmin(jnp.where(jnp.isfinite(energies), energies, jnp.inf))]
     found = jax.lax.stop_gradient(_minimised(linearised, start))
     # One more step, whose stiffness is a constant, has the derivative of the equilibrium.
     stress = jax.grad(point.energy)(gradient(found.d), tissue) - jnp.diag(pulls)
