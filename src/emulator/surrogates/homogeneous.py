@@ -239,9 +239,9 @@ def equilibrium(
     # Exponential laws overshoot in strain: a pull's equilibrium is looked for near the best guess.
     along = jnp.where(own, jnp.append(pulls, 0.0)[jnp.minimum(axes, 3)], 0.0)
     along = along / jnp.maximum(jnp.max(jnp.abs(along)), jnp.finfo(along.dtype).tiny)
-    guesses = start + (1.0 + start) * jnp.asarray(guesses)[:, None] * along
-    energies = jax.vmap(potential)(guesses)
-    start = guesses[jnp.argmin(jnp.where(jnp.isfinite(energies), energies, jnp.inf))]
+    tried = start + (1.0 + start) * jnp.asarray(guesses)[:, None] * along
+    energies = jax.vmap(potential)(tried)
+    start = tried[jnp.argmin(jnp.where(jnp.isfinite(energies), energies, jnp.inf))]
     found = jax.lax.stop_gradient(_minimised(linearised, start))
     # One more step, whose stiffness is a constant, has the derivative of the equilibrium.
     stress = jax.grad(point.energy)(gradient(found.d), tissue) - jnp.diag(pulls)
