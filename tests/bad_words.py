@@ -14,6 +14,15 @@ COMMANDS = [
         "mesh --endocardium none.stl --epicardium no.stl --out lv.xyz",
         "--out lv.xyz: the file name must end in .vtu",
     ),
+    (
+        "frames left_ventricle --surface endocardium --out frames.csv",
+        "--surface 'endocardium'; give each as SET@STATE=FILE",
+    ),
+    (
+        "frames left_ventricle --surface endocardium@a=none.stl --out frames.csv",
+        "none.stl does not exist",
+    ),
+    ("frames left_ventricle --out frames.csv", "are required: --surface"),
     ("simulate beam", "scene 'beam' is unknown"),
     ("simulate missing.toml", "missing.toml does not exist"),
     ("simulate once_clamped_beam --theta mu=500 lam=60", "parameter 'mu' is 500 kPa"),

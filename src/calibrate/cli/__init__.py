@@ -37,6 +37,7 @@ COMMANDS = {
     "effects": "analyses",
     "evaluate": "emulators",
     "explore": "serving",
+    "frames": "scene_files",
     "identify": "analyses",
     "infer": "posteriors",
     "init": "scene_files",

@@ -33,6 +33,7 @@ WORDS = [
     "effects scene.toml --observe nodes:4 --tolerance 0.1mm --samples 2",
     "evaluate once_clamped_beam --against fem --cases 2",
     "explore once_clamped_beam --no-browser",
+    "frames left_ventricle --surface endocardium@a=endo.stl --points 5 --out frames.csv",
     f"identify before {BEAM}",
     "identify after one --next nodes:4",
     f"{INFER} three",
@@ -106,7 +107,7 @@ def test_examples_of_help_are_words_that_the_commands_know():
     examples = [
         example.split()
         for _, parser in commands()
-        for example in re.findall(r"calibrate ((?:[\w.:/+=-]+ ?)+)", parser.epilog or "")
+        for example in re.findall(r"calibrate ((?:[\w.:/+=@-]+ ?)+)", parser.epilog or "")
     ]
     assert len(examples) > 15
     for words in examples:

@@ -210,6 +210,59 @@ def mesh(arguments: Namespace) -> Answer:
     return Answer(result, "\n".join(lines))
 
 
+@command(
+    words.add_scene,
+    option(
+        "--surface",
+        "SET@STATE=FILE",
+        "the surface of a facet set in a frame, triangles; one for each set and frame",
+        nargs="+",
+        required=True,
+    ),
+    option("--points", "N", "points of a facet set (default: 60)", type=int, default=60),
+    option("--unit", "mm|cm|m|um", "of the surfaces' coordinates (default: mm)", default="mm"),
+    option("--out", "FILE", "data to write, CSV or .nc", required=True),
+    help="surfaces of an image's frames as data",
+    description="Writes how far the surface of each frame is from the scene's mesh, along normals "
+    "at evenly spread points, and the volume within each cavity, as infer --data takes them.",
+    epilog="example: calibrate frames heart.toml --surface lv_endocardium@es=lv_010.obj "
+    "epicardium@es=epi_010.obj --out frames.csv",
+)
+def frames(arguments: Namespace) -> Answer:
+    """Measure the surfaces, and write the data."""
+    import numpy as np
+
+    from calibrate.measurements.data import write_data
+    from calibrate.measurements.frames import frame_data
+    from emulator.core.errors import look_up
+    from emulator.geometry.surfaces import UNITS, read_surface
+
+    check_folder(Path(arguments.out).parent)
+    look_up(UNITS, arguments.unit, "unit")
+    surfaces = {}
+    for word in arguments.surface:
+        name, equals, path = word.partition("=")
+        if not (name and equals and path) or name in surfaces:
+            raise InputError(
+                f"--surface '{word}'; give each as SET@STATE=FILE, such as lv_endocardium@es=lv.obj"
+            )
+        surfaces[name] = read_surface(path, name, UNITS[arguments.unit])
+    observe, data = frame_data(words.scene_of(arguments), surfaces, arguments.points)
+    write_data(arguments.out, observe, data)
+    rows, result = [], {}
+    for name, values in data.items():
+        known = values[np.isfinite(values)]
+        of = {
+            "mean": float(known.mean()),
+            "sd": float(known.std()),
+            "missing": int(np.isnan(values).sum()),
+        }
+        result[name] = of
+        rows.append((name, f"{of['mean']:.4g}", f"{of['sd']:.3g}", of["missing"]))
+    told = table(("data", "mean (mm, mL)", "sd", "missing"), rows)
+    return Answer({"out": arguments.out, "data": result}, f"{told}\nwritten to {arguments.out}")
+
+
 _WIDTH = 79
 
 

@@ -1,0 +1,131 @@
+r"""Surfaces of an image's frames as data: how far each is from the body at rest, along its normals.
+
+At points X of a facet set with normal n, the surface of a frame is met by the line along the
+normal at
+
+.. math:: s = \min |s| \quad\text{with}\quad X + s\, n \in \text{surface} ,
+
+on a triangle that faces the same way as most others. That is an observation ``surface``
+(:mod:`calibrate.measurements.surface`): what slides along the surface is not seen. Points are
+spread evenly, away from rims, which a surface of another frame need not reach. The cavity within a
+frame's surface, with flat lids on its openings, is an observation ``volume``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from calibrate.measurements.collection import Observations, observations
+from calibrate.measurements.location import facet_shapes
+from calibrate.measurements.observation import Observation
+from calibrate.measurements.surface import SurfacePoints
+from calibrate.measurements.volume import CavityVolume
+from calibrate.state_names import in_state, split
+from emulator.core.errors import InputError
+from emulator.geometry.facets import MM3_PER_ML, openings, rim
+from emulator.geometry.mesh import Mesh
+from emulator.geometry.surfaces import Surface
+from emulator.scenes.scene import Scene, cavity_sets
+
+POINTS = 60
+"""Default number of points of a surface."""
+_MARGIN = 0.05  # of the body's size, from rims to the nearest point
+_REACH = 0.25  # of the body's size, the farthest that a surface may be away
+_STEEP = 0.3  # cosine between normal and triangle below which the line grazes it
+
+
+def frame_data(
+    scene: Scene, surfaces: Mapping[str, Surface], points: int = POINTS
+) -> tuple[Observations, dict[str, np.ndarray]]:
+    """Return the observations that surfaces of frames make, and their data.
+
+    Parameters
+    ----------
+    scene : the scene, whose mesh is the body at rest, or the loaded body of an image.
+    surfaces : the surface of a frame by facet set and load state, ``lv_endocardium@systole``.
+    points : the number of points of each facet set.
+
+    Raises
+    ------
+    InputError
+        An unknown facet set, fewer than 1 point, or a surface that is nowhere near its facet set.
+    """
+    if points < 1:
+        raise InputError(f"{points} points; give 1 or more")
+    observe, data = dict[str, Observation](), dict[str, np.ndarray]()
+    places = dict[str, SurfacePoints]()
+    for name, surface in surfaces.items():
+        facet_set, state = split(name)
+        at = in_state("", state)
+        if facet_set not in places:
+            even = spread_evenly(scene.mesh, facet_set, points)
+            places[facet_set] = SurfacePoints.of(scene, facet_set, even)
+        part = places[facet_set]
+        ways = along_normals(part.points, part.normals, surface, _REACH * scene.mesh.size)
+        if np.isnan(ways).mean() > 0.5:
+            raise InputError(
+                f"'{name}': only {int(np.isfinite(ways).sum())} of {len(ways)} lines along the "
+                f"normals of '{facet_set}' meet the surface within "
+                f"{_REACH * scene.mesh.size:.3g} mm; is it in the mesh's place and unit?"
+            )
+        observe[f"surface:{facet_set}{at}"], data[f"surface:{facet_set}{at}"] = part, ways
+        rims = len(openings(scene.mesh.facet_set(facet_set)))
+        if facet_set in cavity_sets(scene) and len(surface.rims) == rims:
+            volume = f"volume:{facet_set}{at}"
+            observe[volume] = CavityVolume(scene, facet_set)
+            data[volume] = np.array(surface.volume / MM3_PER_ML)
+    return observations(observe), data
+
+
+def spread_evenly(mesh: Mesh, facet_set: str, count: int) -> np.ndarray:
+    """Return middles (count, 3) mm of facets of a set, each the farthest from those before it.
+
+    :class:`InputError` where the set has fewer facets away from its rims.
+    """
+    facets = mesh.facet_set(facet_set)
+    values, _ = facet_shapes(np.full((1, 3), 1.0 / 3.0), facets.shape[1])
+    places = np.einsum("a,kai->ki", values[0], mesh.nodes[facets])
+    edges = mesh.nodes[np.unique(rim(facets))]
+    if len(edges):
+        far = cKDTree(edges, balanced_tree=False).query(places)[0] > _MARGIN * mesh.size
+        places = places[far]
+    if len(places) < count:
+        raise InputError(
+            f"facet set '{facet_set}' has {len(places)} facets away from its rims; ask for fewer "
+            f"points than {count}"
+        )
+    chosen = [0]
+    ways = np.linalg.norm(places - places[0], axis=1)
+    for _ in range(count - 1):
+        chosen.append(int(np.argmax(ways)))
+        ways = np.minimum(ways, np.linalg.norm(places - places[chosen[-1]], axis=1))
+    return places[chosen]
+
+
+def along_normals(
+    points: np.ndarray, normals: np.ndarray, surface: Surface, reach: float
+) -> np.ndarray:
+    """Return the way (d,) in mm from ``points`` along unit ``normals`` (d, 3) to a surface.
+
+    NaN where the line does not meet it within ``reach`` mm to either side.
+    """
+    a, b, c = np.moveaxis(surface.points[surface.triangles], 1, 0)
+    area = np.cross(b - a, c - a)
+    unit = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-300)
+    ways, cosines = np.full((2, len(points), len(a)), np.nan)
+    for k, (x, n) in enumerate(zip(points, normals, strict=True)):
+        turned = unit @ n
+        steep = np.abs(turned) > _STEEP
+        s = np.einsum("ti,ti->t", a - x, unit) / np.where(steep, turned, 1.0)
+        at = x + s[:, None] * n
+        inside = steep & (np.abs(s) <= reach)
+        for start, end in ((a, b), (b, c), (c, a)):
+            inside &= np.einsum("ti,ti->t", np.cross(end - start, at - start), area) >= 0.0
+        ways[k, inside], cosines[k, inside] = s[inside], turned[inside]
+    side = np.sign(np.nansum(np.sign(cosines)))
+    ways[~(side * cosines > 0.0)] = np.nan
+    nearest = np.argmin(np.where(np.isnan(ways), np.inf, np.abs(ways)), axis=1)
+    return ways[np.arange(len(points)), nearest]
