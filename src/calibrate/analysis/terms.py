@@ -39,7 +39,7 @@ class HeldOut:
     test : its name.
     points : the number of its points.
     error : the root mean square error of the mean prediction, as a share of that of zero. Points
-        are weighted by their noise's sd.
+        are in sds of their noise.
     in_noise : the same error, in sds of the noise as the other tests have it.
     inside : the share of points inside the 90 % predictive band, noise included.
     of_sets : the log predictive density of a point, on average, by each set of ``Terms.sets``.

@@ -5,7 +5,7 @@ normal at
 
 .. math:: s = \min |s| \quad\text{with}\quad X + s\, n \in \text{surface} ,
 
-on a triangle that faces the same way as most others. That is an observation ``surface``
+on a triangle that faces as the facet does. That is an observation ``surface``
 (:mod:`calibrate.measurements.surface`): what slides along the surface is not seen. Points are
 spread evenly, away from rims, which a surface of another frame need not reach. The cavity within a
 frame's surface, with flat lids on its openings, is an observation ``volume``.
@@ -13,7 +13,7 @@ frame's surface, with flat lids on its openings, is an observation ``volume``.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -25,7 +25,7 @@ from calibrate.measurements.surface import SurfacePoints
 from calibrate.measurements.volume import CavityVolume
 from calibrate.state_names import in_state, split
 from emulator.core.errors import InputError
-from emulator.geometry.facets import MM3_PER_ML, openings, rim
+from emulator.geometry.facets import MM3_PER_ML, enclosed_volume, encloses, openings, rim
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.surfaces import Surface
 from emulator.scenes.scene import Scene, cavity_sets
@@ -33,7 +33,7 @@ from emulator.scenes.scene import Scene, cavity_sets
 POINTS = 60
 """Default number of points of a surface."""
 _MARGIN = 0.05  # of the body's size, from rims to the nearest point
-_REACH = 0.25  # of the body's size, the farthest that a surface may be away
+_REACH = 0.2  # of the body's size, the farthest that a surface may be away
 _STEEP = 0.3  # cosine between normal and triangle below which the line grazes it
 
 
@@ -64,7 +64,8 @@ def frame_data(
             even = spread_evenly(scene.mesh, facet_set, points)
             places[facet_set] = SurfacePoints.of(scene, facet_set, even)
         part = places[facet_set]
-        ways = along_normals(part.points, part.normals, surface, _REACH * scene.mesh.size)
+        outward = _outward(scene.mesh, facet_set)
+        ways = along_normals(part.points, part.normals, surface, _REACH * scene.mesh.size, outward)
         if np.isnan(ways).mean() > 0.5:
             raise InputError(
                 f"'{name}': only {int(np.isfinite(ways).sum())} of {len(ways)} lines along the "
@@ -94,8 +95,8 @@ def spread_evenly(mesh: Mesh, facet_set: str, count: int) -> np.ndarray:
         places = places[far]
     if len(places) < count:
         raise InputError(
-            f"facet set '{facet_set}' has {len(places)} facets away from its rims; ask for fewer "
-            f"points than {count}"
+            f"facet set '{facet_set}' has {len(places)} facets away from its rims; "
+            + (f"ask for fewer points than {count}" if len(places) else "observe another")
         )
     chosen = [0]
     ways = np.linalg.norm(places - places[0], axis=1)
@@ -105,12 +106,24 @@ def spread_evenly(mesh: Mesh, facet_set: str, count: int) -> np.ndarray:
     return places[chosen]
 
 
+def _outward(mesh: Mesh, facet_set: str) -> float:
+    """Return 1 where the facets' normals point out of what they enclose, -1 into it, 0 of none."""
+    if not encloses(mesh, facet_set):
+        return 0.0
+    volume: Callable[[np.ndarray], np.ndarray] = enclosed_volume(mesh.facet_set(facet_set))
+    return float(np.sign(volume(mesh.nodes - mesh.nodes.mean(axis=0))))
+
+
 def along_normals(
-    points: np.ndarray, normals: np.ndarray, surface: Surface, reach: float
+    points: np.ndarray, normals: np.ndarray, surface: Surface, reach: float, outward: float = 0.0
 ) -> np.ndarray:
     """Return the way (d,) in mm from ``points`` along unit ``normals`` (d, 3) to a surface.
 
     NaN where the line does not meet it within ``reach`` mm to either side.
+
+    outward : 1 where the normals point out of what the surface encloses, as its triangles do, -1
+        where they point into it: walls on the other side of a cavity do not count. 0 for what most
+        of the nearest triangles say.
     """
     a, b, c = np.moveaxis(surface.points[surface.triangles], 1, 0)
     area = np.cross(b - a, c - a)
@@ -125,7 +138,11 @@ def along_normals(
         for start, end in ((a, b), (b, c), (c, a)):
             inside &= np.einsum("ti,ti->t", np.cross(end - start, at - start), area) >= 0.0
         ways[k, inside], cosines[k, inside] = s[inside], turned[inside]
-    side = np.sign(np.nansum(np.sign(cosines)))
+    rows = np.arange(len(points))
+
+    def nearest() -> np.ndarray:
+        return np.argmin(np.where(np.isnan(ways), np.inf, np.abs(ways)), axis=1)
+
+    side = outward or np.sign(np.nansum(np.sign(cosines[rows, nearest()])))
     ways[~(side * cosines > 0.0)] = np.nan
-    nearest = np.argmin(np.where(np.isnan(ways), np.inf, np.abs(ways)), axis=1)
-    return ways[np.arange(len(points)), nearest]
+    return ways[rows, nearest()]

@@ -29,17 +29,17 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from emulator.core.errors import InputError, look_up
-from emulator.geometry.discretisation import discretise, mesh_quality
-from emulator.geometry.facets import MM3_PER_ML, Cavity
+from emulator.geometry.discretisation import mesh_quality
 from emulator.geometry.fibres import BOTH
 from emulator.geometry.mesh import SIDES, Mesh
-from emulator.geometry.refinement import to_linear, unfolded
+from emulator.geometry.refinement import to_linear
 from emulator.geometry.remeshing import DiscMap, Unmeshable, rim_loops, triangulate
 from emulator.geometry.surfaces import (
     UNITS,
     Surface,
     area_vector,
     axes_across,
+    axis_to_rims,
     clipped,
     closed,
     inside,
@@ -52,6 +52,7 @@ from emulator.geometry.wall import (
     distances,
     farthest,
     fill,
+    measured,
     mesh_that_fits,
     surface_in_mm,
     thickness_of,
@@ -88,7 +89,8 @@ def mesh_heart(
     """Mesh the walls of both ventricles with tetrahedra, open at the valves or at the base.
 
     The mesh has facet sets lv_endocardium, rv_endocardium and epicardium; base, where the wall
-    ends; and mitral, aortic, tricuspid and pulmonary, the parts of it around each valve.
+    ends; and mitral, aortic, tricuspid and pulmonary, the parts of it around each valve, or
+    lv_endocardium_base of a ventricle whose openings are not told apart.
 
     Parameters
     ----------
@@ -99,7 +101,7 @@ def mesh_heart(
     order : 2 for quadratic elements with curved edges on the surfaces, or 1.
     smooth : times of Taubin's filter on all surfaces.
     least : the least thickness of a wall, mm; the epicardium is moved to where it has it.
-    unit : the unit of the files, ``mm``, ``cm`` or ``m``.
+    unit : the unit of the files, ``mm``, ``cm``, ``m`` or ``um``.
 
     Raises
     ------
@@ -122,36 +124,22 @@ def mesh_heart(
     _check_places([*inner, outer])
     moved = [*inner, _away(outer, inner, least)]
     surfaces = [*inner, _without_edge(moved[2], inner)]
-    rims = [given[0].points[loop] for loop in rim_loops(given[0])]
-    axis = np.sum([area_vector(rim) for rim in rims], axis=0)
-    axis /= np.linalg.norm(axis)
-    axis *= np.sign((np.concatenate(rims).mean(axis=0) - given[0].points.mean(axis=0)) @ axis)
-    ways = distances(surfaces[0].points, surfaces[1:])
+    axis = axis_to_rims(given[0])
     make = partial(_mesh, [DiscMap(each) for each in surfaces], _joints(surfaces), axis, order)
-    thickness = thickness_of(ways)
+    thickness = thickness_of(distances(surfaces[0].points, surfaces[1:]))
     area = sum(each.area for each in surfaces)
     length, before = mesh_that_fits(
         make, thickness, size, np.sqrt(area / _SQUARES), given[2].extent
     )
-    mesh, folded = unfolded(before) if order == 2 else (before, 0)
-    volumes = [each.volume / MM3_PER_ML for each in given]
-    wall = float(discretise(mesh).weights.sum()) / MM3_PER_ML
-    return Wall(
-        mesh=mesh,
+    rims = np.concatenate([given[0].points[loop] for loop in rim_loops(given[0])])
+    return measured(
+        before,
+        given,
         axis=axis,
-        base=np.concatenate(rims).mean(axis=0),
+        base=rims.mean(axis=0),
         size=length,
         thickness=thickness,
-        cavities={
-            name: (Cavity(mesh, name).rest, own)
-            for name, own in zip((LEFT, RIGHT), volumes, strict=False)
-        },
-        wall=(wall, volumes[2] - volumes[1] - volumes[0]),
-        cut_off=(0.0, 0.0),
         moved=farthest(*(s.points for pair in zip(given, moved, strict=True) for s in pair)),
-        folded=(folded, farthest(mesh.nodes, before.nodes)),
-        warnings=(),
-        quality=mesh_quality(mesh),
     )
 
 
@@ -194,7 +182,12 @@ def _joints(surfaces: Sequence[Surface]) -> dict[str, Joint]:
                 f"{surfaces[2].name}: neither endocardium has an opening at that around "
                 f"{place_of(rim.mean(axis=0))}, of {len(rim)} edges; fill it"
             )
-    return {names[n] if len(own) == 2 else "base": own for n, own in joints.items()}
+    if len(joints) == 1:
+        return {"base": joints[0]}
+    return {
+        names[n] if len(own) == 2 else f"{surfaces[own[1][0]].name}_base": own
+        for n, own in joints.items()
+    }
 
 
 def _check_places(surfaces: Sequence[Surface]) -> None:

@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 
 from emulator.core.errors import InputError
 from emulator.geometry.mesh import SIDES
-from emulator.geometry.surfaces import Surface, sampled
+from emulator.geometry.surfaces import Surface, axis_to_rims, sampled
 
 _FARTHEST = 1.3  # times the nearest distance
 _STEPS, _MET = 30, 0.05  # of the search along a normal, and the gap over the thickness that ends it
@@ -62,10 +62,8 @@ def left_wall(endocardium: Surface, epicardium: Surface, right: Surface) -> Left
             "endocardium: it is closed; cut from a heart of two ventricles it is open at its valves"
         )
     edges = np.concatenate(rims)
-    axis = np.cross(endocardium.points[edges[:, 0]], endocardium.points[edges[:, 1]]).sum(axis=0)
-    axis /= np.linalg.norm(axis)
+    axis = axis_to_rims(endocardium)
     heights = endocardium.points @ axis
-    axis, heights = (a * np.sign(heights[edges].mean() - heights.mean()) for a in (axis, heights))
     mean, normals = _neighbours(endocardium), endocardium.normals
     for _ in range(_EVEN):
         normals = mean @ normals

@@ -51,6 +51,7 @@ def triangulate(
     loops : (k, 2) corners in order, of the outer polygon and of those cut out of it.
     size : edge length inside, in the corners' unit, or a function of x and y.
     """
+    _check_polygons(loops)
     with _model() as gmsh:
         geo, rings, first = gmsh.model.geo, [], 1
         for loop in loops:
@@ -72,6 +73,28 @@ def triangulate(
         gmsh.model.mesh.generate(2)
         places, triangles = _cells(gmsh, 3)
         return places[:, :2], triangles
+
+
+def _check_polygons(loops: Sequence[np.ndarray]) -> None:
+    """Raise :class:`Unmeshable` unless no polygon crosses another, and the first is around them."""
+    starts = np.concatenate([np.asarray(loop) for loop in loops])
+    ends = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops])
+
+    def side(points: np.ndarray) -> np.ndarray:
+        """Return on which side of each edge (e,) points (e', 2) lie, (e, e')."""
+        along, to = (ends - starts)[:, None], points[None] - starts[:, None]
+        return np.sign(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0])
+
+    apart = side(starts) * side(ends) < 0.0
+    if (apart & apart.T).any():
+        raise Unmeshable("two rims cross")
+    for loop in loops[1:]:
+        (x, y), (a, b) = loop[0], (loops[0], np.roll(loops[0], -1, axis=0))
+        above = (a[:, 1] > y) != (b[:, 1] > y)
+        steps = np.where(above, b[:, 1] - a[:, 1], 1.0)
+        crossed = above & (x < a[:, 0] + (y - a[:, 1]) / steps * (b[:, 0] - a[:, 0]))
+        if crossed.sum() % 2 == 0:
+            raise Unmeshable("a rim is outside of the one around it")
 
 
 def tetrahedralise(

@@ -1,7 +1,8 @@
 r"""Surfaces of triangles: reading, checks, cuts by a plane, smoothing, tests of enclosure.
 
-A surface is closed, or open with one rim. What a segmentation gives is rough: Taubin's filter moves
-each point to the mean of its neighbours by a fraction :math:`\lambda` and back by :math:`\mu`,
+A surface is closed, or open with a rim or several. What a segmentation gives is rough: Taubin's
+filter moves each point to the mean of its neighbours by a fraction :math:`\lambda` and back by
+:math:`\mu`,
 
 .. math:: x \leftarrow (1 + \mu L)(1 + \lambda L)\, x, \qquad \lambda > 0 > \mu, \quad
           |\mu| > \lambda,
@@ -307,6 +308,12 @@ def rim_loops(surface: Surface) -> list[np.ndarray]:
     loops = []
     for edges in surface.rims:
         successor = dict(edges.tolist())
+        if len(successor) < len(edges):
+            starts, counts = np.unique(edges[:, 0], return_counts=True)
+            place = surface.points[starts[np.argmax(counts)]]
+            raise InputError(
+                f"{surface.name}: two of its openings touch at {place_of(place)}; fill one there"
+            )
         loop = [int(edges[0, 0])]
         while (next_one := successor[loop[-1]]) != loop[0]:
             loop.append(next_one)
@@ -323,6 +330,14 @@ def area_vector(polygon: np.ndarray) -> np.ndarray:
     """Return the area vector (3,) mm2 of a closed polygon (k, 3)."""
     middle = polygon - polygon.mean(axis=0)
     return 0.5 * np.cross(middle, np.roll(middle, -1, axis=0)).sum(axis=0)
+
+
+def axis_to_rims(surface: Surface) -> np.ndarray:
+    """Return the unit area vector (3,) of all rims together, towards them."""
+    rims = [surface.points[loop] for loop in rim_loops(surface)]
+    axis = np.sum([area_vector(rim) for rim in rims], axis=0)
+    axis *= np.sign((np.concatenate(rims).mean(axis=0) - surface.points.mean(axis=0)) @ axis)
+    return axis / np.linalg.norm(axis)
 
 
 def sampled(surface: Surface, values: np.ndarray, finest: float) -> np.ndarray:

@@ -18,11 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from emulator.core.errors import InputError, look_up
-from emulator.geometry.discretisation import discretise, mesh_quality
-from emulator.geometry.facets import MM3_PER_ML, Cavity
+from emulator.geometry.facets import MM3_PER_ML
 from emulator.geometry.left_wall import left_wall
 from emulator.geometry.mesh import Mesh, signed_volumes
-from emulator.geometry.refinement import unfolded
 from emulator.geometry.remeshing import DiscMap, Unmeshable, triangulate
 from emulator.geometry.surfaces import (
     UNITS,
@@ -39,6 +37,7 @@ from emulator.geometry.wall import (
     distances,
     farthest,
     fill,
+    measured,
     mesh_that_fits,
     surface_in_mm,
     thickness_of,
@@ -81,7 +80,7 @@ def mesh_wall(
     base_point : a point (3,) mm of the plane instead.
     smooth : times of Taubin's filter on both surfaces; 10 to 30 take the steps off surfaces of
         voxels.
-    unit : the unit of the files, ``mm``, ``cm`` or ``m``; size and base plane are in mm.
+    unit : the unit of the files, ``mm``, ``cm``, ``m`` or ``um``; size and base plane are in mm.
 
     Raises
     ------
@@ -126,21 +125,15 @@ def mesh_wall(
     length, before = mesh_that_fits(
         make, thickness, size, _SIZE * thickness.median, intact[1].extent
     )
-    mesh, folded = unfolded(before) if order == 2 else (before, 0)
-    cavity, whole = (each.volume / MM3_PER_ML for each in below)
-    wall = Wall(
-        mesh=mesh,
+    wall = measured(
+        before,
+        below,
         axis=normal,
         base=below[0].points[np.unique(one_rim(below[0]))].mean(axis=0),
         size=length,
         thickness=thickness,
-        cavities={"endocardium": (Cavity(mesh, "endocardium").rest, cavity)},
-        wall=(float(discretise(mesh).weights.sum()) / MM3_PER_ML, whole - cavity),
-        cut_off=(float(height), above) if is_cut else (0.0, 0.0),
         moved=farthest(inner.points, below[0].points, outer.points, below[1].points),
-        folded=(folded, farthest(mesh.nodes, before.nodes)),
-        warnings=(),
-        quality=mesh_quality(mesh),
+        cut_off=(float(height), above) if is_cut else (0.0, 0.0),
     )
     return replace(wall, warnings=tuple(_doubts(wall, inner.volume / MM3_PER_ML)))
 

@@ -11,9 +11,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from emulator.core.errors import InputError
-from emulator.geometry.discretisation import MeshQuality
+from emulator.geometry.discretisation import MeshQuality, discretise, mesh_quality
+from emulator.geometry.facets import MM3_PER_ML, Cavity
 from emulator.geometry.mesh import SIDES, Mesh, find_rows, orient
-from emulator.geometry.refinement import to_quadratic
+from emulator.geometry.refinement import to_quadratic, unfolded
 from emulator.geometry.remeshing import DiscMap, Remeshed, Unmeshable, tetrahedralise
 from emulator.geometry.surfaces import UNITS, Surface, place_of, read_surface
 
@@ -101,6 +102,44 @@ class Wall:
                 f"edges moved by {self.folded[1]:.2g} mm at most"
             )
         return [*lines, *self.warnings, self.quality.sentence()]
+
+
+def measured(
+    before: Mesh,
+    surfaces: Sequence[Surface],
+    *,
+    axis: np.ndarray,
+    base: np.ndarray,
+    size: float,
+    thickness: Thickness,
+    moved: float,
+    cut_off: tuple[float, float] = (0.0, 0.0),
+) -> Wall:
+    """Return the wall of a mesh, unfolded, beside its surfaces, the epicardium last.
+
+    Parameters
+    ----------
+    before : the mesh, which may be curved so much that it folds.
+    surfaces : what it was made from, named as its facet sets.
+    axis, base, size, thickness, moved, cut_off : see :class:`Wall`.
+    """
+    mesh, folded = unfolded(before) if before.order == 2 else (before, 0)
+    *cavities, whole = (each.volume / MM3_PER_ML for each in surfaces)
+    named = zip(surfaces, cavities, strict=False)
+    return Wall(
+        mesh=mesh,
+        axis=axis,
+        base=base,
+        size=size,
+        thickness=thickness,
+        cavities={each.name: (Cavity(mesh, each.name).rest, own) for each, own in named},
+        wall=(float(discretise(mesh).weights.sum()) / MM3_PER_ML, whole - sum(cavities)),
+        cut_off=cut_off,
+        moved=moved,
+        folded=(folded, farthest(mesh.nodes, before.nodes)),
+        warnings=(),
+        quality=mesh_quality(mesh),
+    )
 
 
 def farthest(*points: np.ndarray) -> float:

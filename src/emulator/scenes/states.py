@@ -158,6 +158,11 @@ def components_of(columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.nda
         assert found is not None
         measure, axis, *plane = found.groups()
         numbers = np.asarray(values, dtype=float)
+        if numbers.shape != (count,):
+            raise InputError(
+                f"column '{word}' has shape {numbers.shape}, the first one ({count},); give each "
+                "a value a state"
+            )
         own = plane if axis is None else [axis] if measure == APPLIED else [axis, axis]
         place = tuple(AXES.index(a) for a in own)
         if place in sources or (axis is None and place[0] == place[1]):

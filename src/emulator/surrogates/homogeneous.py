@@ -116,8 +116,8 @@ class Homogeneous:
     def _free(self, elements: np.ndarray) -> tuple[jax.Array, jax.Array]:
         """Return the axes (e, u) of the free stretches, 3 for none, and that of the last, (e,).
 
-        The last one follows from the others where the specimen is incompressible, else it is 3. No
-        pull is along it if there is another free direction.
+        The last one follows from the others where the specimen is incompressible, else it is 3.
+        It is one without a pull, if any free direction has none.
         """
         free, pulls = self.states.free[elements], self.states.pulls[elements]
         order = np.argsort(2 * ~free + 1 * (pulls == 0.0), axis=1, kind="stable")

@@ -108,3 +108,16 @@ def test_what_is_no_frame_is_refused(scene):
         frame_data(scene, {WALL: grown}, 0)
     with pytest.raises(InputError, match="ask for fewer points than 5000"):
         frame_data(scene, {WALL: grown}, 5000)
+
+
+@pytest.mark.parametrize("share", [0.75, 0.6])
+def test_the_other_side_of_a_cavity_that_empties_is_not_taken(scene, share):
+    """A line through the cavity meets both sides; the far one faces the other way."""
+    middle = scene.mesh.nodes[np.unique(scene.mesh.facet_set(WALL))].mean(axis=0)
+    small = frame(scene, lambda X: middle + share * (X - middle))
+    observe, data = frame_data(scene, {f"{WALL}@es": small}, 40)
+    part, ways = observe.parts[f"surface:{WALL}@es"], data[f"surface:{WALL}@es"]
+    known = np.isfinite(ways)
+    assert known.mean() > 0.7  # the others are near the rim, which has moved
+    expected = (1.0 - share) * np.sum((middle - part.points) * part.normals, axis=1)
+    assert np.abs(ways - expected)[known].max() < 4.0  # mm, of 5 to 30

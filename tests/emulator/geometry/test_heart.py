@@ -1,5 +1,7 @@
 """Both ventricles from three surfaces: a generator's, with valves anywhere, and a scanner's."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from emulator.geometry.facets import Cavity
 from emulator.geometry.generators.biventricle import biventricle
 from emulator.geometry.generators.ellipsoid import HUMAN
 from emulator.geometry.heart import mesh_heart, zipped
-from emulator.geometry.remeshing import triangulate
+from emulator.geometry.remeshing import Unmeshable, triangulate
 from emulator.geometry.surfaces import Surface, clipped, rim_loops, surface
 from emulator.scenes.draft import draft_scene
 from emulator.scenes.fibre_rules import Biventricle
@@ -167,6 +169,23 @@ def test_what_is_no_heart_is_refused(flat, number):
         mesh_heart(*named, **words)
 
 
+def test_openings_that_touch_are_refused(flat):
+    left, right, outer = flat
+    at = int(np.argmin(left.points[:, 2]))
+    ring = np.flatnonzero((left.triangles == at).any(axis=1))
+    rows = np.delete(left.triangles, ring[[0, len(ring) // 2]], axis=0)
+    with pytest.raises(InputError, match="two of its openings touch at"):
+        mesh_heart(replace(left, triangles=rows), right, outer)
+
+
+def test_rims_that_cross_are_not_given_to_gmsh():
+    turn = 2.0 * np.pi * np.arange(12) / 12
+    circle = np.column_stack([np.cos(turn), np.sin(turn)])
+    for inner, said in ((8.0 * circle + [15.0, 0.0], "cross"), (circle + 40.0, "outside")):
+        with pytest.raises(Unmeshable, match=said):
+            triangulate([20.0 * circle, inner], 3.0)
+
+
 def test_by_the_command_line_to_a_scene(flat, tmp_path, capsys):
     needs_gmsh()
     from calibrate.cli import main
@@ -181,6 +200,13 @@ def test_by_the_command_line_to_a_scene(flat, tmp_path, capsys):
     draft = draft_scene(out, tmp_path / "heart.toml")
     assert draft.scene.parameter_names[-2:] == ("pressure", "right_pressure")
     assert 'rule = "biventricle"' in draft.path.read_text()
+    for more, said in (
+        (["--base-height", "1"], "has no effect on both ventricles"),
+        (["--axis", "0", "0", "1"], "has no effect on both ventricles"),
+    ):
+        assert said in complaint(capsys, *words, "--out", out, *more)
+    one = ["mesh", "--endocardium", files[0], "--epicardium", files[2], "--out", out]
+    assert "give the right ventricle's" in complaint(capsys, *one, "--ventricles", "left")
     swapped = ["mesh", "--endocardium", files[2], "--right", files[1], "--epicardium", files[0]]
     assert "are swapped" in complaint(capsys, *swapped, "--out", out)
 

@@ -129,14 +129,13 @@ _PLACE = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
     option(
         "--ventricles",
         choices=("both", "left"),
-        default="both",
         help="of a heart with --right: mesh both, or the left wall alone (default: both)",
     ),
     option("--out", "FILE.vtu", "mesh to write, in mm", required=True),
     option(
         "--size",
         "MM",
-        "edges (default: 0.7 of the median thickness, or less in a thin wall)",
+        "edges (default: 0.7 of the median thickness; of both ventricles, for some 10 000 nodes)",
         type=float,
     ),
     option(
@@ -174,7 +173,17 @@ def mesh(arguments: Namespace) -> Answer:
     words.check_vtu(out)
     if picture is not None:
         check_folder(Path(picture).parent)
-    both = arguments.right is not None and arguments.ventricles == "both"
+    both = arguments.right is not None and arguments.ventricles != "left"
+    if arguments.right is None and arguments.ventricles is not None:
+        raise InputError(
+            f"--ventricles {arguments.ventricles}: give the right ventricle's endocardium, --right"
+        )
+    for name in ("axis", "base_height", "base_point"):
+        if both and getattr(arguments, name) is not None:
+            raise InputError(
+                f"--{name.replace('_', '-')} has no effect on both ventricles, which end at their "
+                "valves; give --ventricles left"
+            )
     make = mesh_heart if both else mesh_wall
     wall = make(**words.parameters(make, arguments))
     write_mesh(out, wall.mesh)
@@ -234,11 +243,13 @@ def frames(arguments: Namespace) -> Answer:
 
     from calibrate.measurements.data import write_data
     from calibrate.measurements.frames import frame_data
+    from calibrate.state_names import states_of
     from emulator.core.errors import look_up
     from emulator.geometry.surfaces import UNITS, read_surface
 
     check_folder(Path(arguments.out).parent)
     look_up(UNITS, arguments.unit, "unit")
+    states_of((word.partition("=")[0] for word in arguments.surface), "surfaces")
     surfaces = {}
     for word in arguments.surface:
         name, equals, path = word.partition("=")

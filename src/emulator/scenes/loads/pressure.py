@@ -207,7 +207,7 @@ class ValvePressure(FollowingPressure):
 
     @override
     def check(self, mesh: Mesh, prescribed: Prescribed) -> None:
-        """Refuse a surface that encloses nothing, or whose openings no lid can close."""
+        """Refuse a surface that encloses nothing."""
         Cavity(mesh, self.facet_set)
 
     @override
@@ -218,7 +218,20 @@ class ValvePressure(FollowingPressure):
     def on_loaded(
         self, grid: Discretisation, fibres: Fibres | None = None
     ) -> tuple[LocalForce, ...]:
-        return tuple(_as_loaded(term) for term in self.terms(grid))
+        return tuple(self._at_rest(term) for term in self.terms(grid))
+
+    def _at_rest(self, term: LocalTerm) -> LocalForce:
+        """Return the force of a potential at its places at rest, whatever the displacement."""
+        with jax.ensure_compile_time_eval():  # a constant that compilers would take minutes to fold
+            values = {self.parameter: jnp.ones(())}
+            zero = jnp.zeros((*term.nodes.shape, 3))
+            slopes = jax.jit(jax.vmap(jax.grad(lambda u, data: term.energy(u, data, values))))
+            forces = -np.asarray(slopes(zero, term.data))
+
+        def force(_: jax.Array, at_rest: jax.Array, values: Values) -> jax.Array:
+            return at_rest if self.known is not None else values[self.parameter] * at_rest
+
+        return LocalForce(term.nodes, forces, force)
 
     def _of_lids(self, grid: Discretisation) -> list[LocalTerm]:
         """Return the potential of the pressure on each lid, one group of all nodes of its rim."""
@@ -233,15 +246,6 @@ class ValvePressure(FollowingPressure):
 
             terms.append(LocalTerm(rim_nodes[None], mesh.nodes[rim_nodes][None], energy))
         return terms
-
-
-def _as_loaded(term: LocalTerm) -> LocalForce:
-    """Return the force of a potential on the shape on which its group's nodes are at rest."""
-
-    def force(w: jax.Array, data: Any, values: Values) -> jax.Array:
-        return -jax.grad(term.energy)(jnp.zeros_like(w), data, values)
-
-    return LocalForce(term.nodes, term.data, force)
 
 
 @dataclass(frozen=True)
