@@ -111,6 +111,7 @@ def test_terms_of_a_twin_are_found(twins):
     assert "do not predict 'xy', which alone shows fs_2, fs_e" in str(found)
 
 
+@pytest.mark.slow
 def test_a_twin_whose_tests_predict_one_another(twins):
     model, _, data = twins
     found = find_terms(model, data)
