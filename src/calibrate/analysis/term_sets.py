@@ -147,7 +147,7 @@ class SetPosterior:
     def predicted(self, i: int, data: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return how the set numbered i predicts other data (k,), in sds of their noise.
 
-        That is, of each point, the mean, the probability of less, and the log density, (k,) each.
+        Returned are the mean, the probability of less and the log density of each point, (k,).
 
         columns : the data (k, p) that one unit of each modulus makes.
         """

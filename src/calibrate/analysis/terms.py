@@ -58,7 +58,7 @@ class HeldOut:
 
     @property
     def missed(self) -> bool:
-        """Whether the other tests do not predict it: too few points are inside the band."""
+        """Whether too few points are inside the band: the other tests do not predict this one."""
         chance = bdtr(round(self.inside * self.points), self.points, 1.0 - 2.0 * _TAIL)
         return self.inside < _MISSED and bool(chance < _CHANCE)
 

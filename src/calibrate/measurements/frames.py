@@ -56,21 +56,22 @@ def frame_data(
     if points < 1:
         raise InputError(f"{points} points; give 1 or more")
     observe, data = dict[str, Observation](), dict[str, np.ndarray]()
-    places = dict[str, SurfacePoints]()
+    places, sides = dict[str, SurfacePoints](), dict[str, float]()
     for name, surface in surfaces.items():
         facet_set, state = split(name)
         at = in_state("", state)
         if facet_set not in places:
             even = spread_evenly(scene.mesh, facet_set, points)
             places[facet_set] = SurfacePoints.of(scene, facet_set, even)
+            sides[facet_set] = _outward(scene.mesh, facet_set)
         part = places[facet_set]
-        outward = _outward(scene.mesh, facet_set)
-        ways = along_normals(part.points, part.normals, surface, _REACH * scene.mesh.size, outward)
+        reach = _REACH * scene.mesh.size
+        ways = along_normals(part.points, part.normals, surface, reach, sides[facet_set])
         if np.isnan(ways).mean() > 0.5:
             raise InputError(
                 f"'{name}': only {int(np.isfinite(ways).sum())} of {len(ways)} lines along the "
                 f"normals of '{facet_set}' meet the surface within "
-                f"{_REACH * scene.mesh.size:.3g} mm; is it in the mesh's place and unit?"
+                f"{reach:.3g} mm; is it in the mesh's place and unit?"
             )
         observe[f"surface:{facet_set}{at}"], data[f"surface:{facet_set}{at}"] = part, ways
         rims = len(openings(scene.mesh.facet_set(facet_set)))

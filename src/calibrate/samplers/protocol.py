@@ -1,4 +1,4 @@
-"""What a sampler provides: its name, options, and draws from a density.
+"""A sampler has a name and options, and draws from a density.
 
 Samplers that are Markov chains give a :class:`Kernel` and options that extend
 :class:`ChainOptions`, and leave the rest to :class:`~calibrate.samplers.chains.ChainSampler`; a

@@ -319,12 +319,9 @@ def zipped(points: np.ndarray, one: np.ndarray, other: np.ndarray) -> np.ndarray
     for loop in loops:
         steps = np.linalg.norm(np.diff(points[loop], axis=0), axis=1)
         shares.append(np.concatenate([[0.0], np.cumsum(steps)]) / steps.sum())
-    ends = np.concatenate(
-        [np.stack([s[1:], np.full(len(s) - 1, k)], 1) for k, s in enumerate(shares)]
-    )
+    ends = [(share, k) for k, own in enumerate(shares) for share in own[1:].tolist()]
     at, rows = [0, 0], []
-    for _, side in ends[np.lexsort(ends.T[::-1])]:
-        k = int(side)
+    for _, k in sorted(ends):
         rows.append((loops[0][at[0]], loops[1][at[1]], loops[k][at[k] + 1]))
         at[k] += 1
     return np.array(rows)
@@ -335,8 +332,8 @@ def _patch(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return triangles (t, 3) between loops, the outer one first, and the points (k, 3) they add.
 
-    As high above the outer loop's plane as the loops' points around them. ``count`` is the number
-    of the first point that is added.
+    The points are as high above the outer loop's plane as those of the loops around them, and
+    numbered from ``count``.
     """
     middle, normal = points[loops[0]].mean(axis=0), area_vector(points[loops[0]])
     frame = axes_across(normal / np.linalg.norm(normal))

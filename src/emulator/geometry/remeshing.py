@@ -32,7 +32,7 @@ from scipy.spatial import cKDTree
 
 from emulator.core.errors import InputError
 from emulator.geometry.mesh import cross_sides
-from emulator.geometry.surfaces import Surface, closed, one_rim, rim_loops, signed_areas
+from emulator.geometry.surfaces import Surface, closed, rim_loops, signed_areas
 
 _TYPES = {3: 2, 4: 4}  # Gmsh's numbers of element types, by their corners
 
@@ -174,19 +174,19 @@ class Remeshed(NamedTuple):
     """Even triangles on a surface.
 
     surface : the triangles. places : their points (n, 2) in the disc.
-    turns : for each rim the share of its length (k,) at which its points are; they come first, rim
+    counts : the number of points of each rim, at even shares of its length; they come first, rim
         by rim and in order.
     """
 
     surface: Surface
     places: np.ndarray
-    turns: tuple[np.ndarray, ...]
+    counts: tuple[int, ...]
 
     @property
     def loops(self) -> list[np.ndarray]:
         """The points (k,) of each rim, in order."""
-        ends = np.cumsum([len(each) for each in self.turns])
-        return [np.arange(end - len(own), end) for end, own in zip(ends, self.turns, strict=True)]
+        ends = np.cumsum(self.counts)
+        return [np.arange(end - own, end) for end, own in zip(ends, self.counts, strict=True)]
 
 
 class Rim(NamedTuple):
@@ -226,7 +226,7 @@ class DiscMap:
         self.surface = surface
         loops = rim_loops(surface)
         if not loops:
-            one_rim(surface)
+            raise InputError(f"{surface.name}: it is closed; only a surface with a rim is mapped")
         whole = closed(surface, loops[1:])
         curves = [surface.points[[*loop, loop[0]]] for loop in loops]
         steps = [np.linalg.norm(np.diff(each, axis=0), axis=1) for each in curves]
@@ -274,14 +274,15 @@ class DiscMap:
             for corners in (places[rows], self.places[self.surface.triangles])
         )
         rows = rows if now == before else rows[:, ::-1]
-        left = Surface(self.surface.name, points, rows).volume / self.surface.volume
-        if not abs(left - 1.0) < _ROUGH:
+        new = Surface(self.surface.name, points, rows)
+        missed = abs(new.volume / self.surface.volume - 1.0)
+        if not missed < _ROUGH:
             raise Unmeshable(
                 f"{self.surface.name}: even triangles with edges of {size:.3g} mm miss "
-                f"{100.0 * abs(left - 1.0):.0f} % of what it encloses; its openings are narrow, "
+                f"{100.0 * missed:.0f} % of what it encloses; its openings are narrow, "
                 f"the longest rim being of {self.rims[0].length:.3g} mm"
             )
-        return Remeshed(Surface(self.surface.name, points, rows), places, tuple(turns))
+        return Remeshed(new, places, tuple(counts))
 
     def _stretch(self) -> np.ndarray:
         """Return lengths on the surface over those in the disc, (n,), from areas around points."""

@@ -62,7 +62,7 @@ class Surface:
         a, b, c = np.moveaxis(self.points[self.triangles], 1, 0)
         sums = np.zeros_like(self.points)
         np.add.at(sums, self.triangles, np.cross(b - a, c - a)[:, None])
-        return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-300)
+        return sums / np.linalg.norm(sums, axis=1, keepdims=True)
 
     @property
     def area(self) -> float:
@@ -348,31 +348,6 @@ def sampled(surface: Surface, values: np.ndarray, finest: float) -> np.ndarray:
     shares = [(i, j, count - i - j) for i in range(count + 1) for j in range(count + 1 - i)]
     at_places = np.array(shares) / count
     return np.einsum("qa,tai->tqi", at_places, values[surface.triangles]).reshape(-1, 3)
-
-
-def crossings(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return edges (c, 2) and triangles (c, 3) that they go through, without a common corner."""
-    edges = np.unique(np.sort(triangles[:, SIDES].reshape(-1, 2), axis=1), axis=0)
-    middles, centres = points[edges].mean(axis=1), points[triangles].mean(axis=1)
-    reach = np.linalg.norm(points[triangles] - centres[:, None], axis=-1).max()
-    reach += 0.5 * np.linalg.norm(points[edges[:, 1]] - points[edges[:, 0]], axis=1).max()
-    near = cKDTree(centres, balanced_tree=False).query_ball_point(middles, reach)
-    edge = np.repeat(np.arange(len(edges)), [len(rows) for rows in near])
-    row = np.concatenate([np.asarray(rows, dtype=np.int64) for rows in near])
-    apart = (edges[edge][:, :, None] != triangles[row][:, None]).all(axis=(1, 2))
-    edge, row = edges[edge[apart]], triangles[row[apart]]
-    a, b, c = np.moveaxis(points[row], 1, 0)
-    ends, normal = points[edge], np.cross(b - a, c - a)
-    low, high = np.einsum("cei,ci->ec", ends - a[:, None], normal)
-    through = low * high < 0.0
-    edge, row, ends, normal = edge[through], row[through], ends[through], normal[through]
-    share = (low[through] / (low - high)[through])[:, None]
-    place = ends[:, 0] + share * (ends[:, 1] - ends[:, 0])
-    corners = points[row]
-    sides = np.roll(corners, -1, axis=1) - corners
-    turn = np.cross(sides, place[:, None] - corners)
-    hit = (np.einsum("csi,ci->cs", turn, normal) > 0.0).all(axis=1)
-    return edge[hit], row[hit]
 
 
 def axes_across(normal: np.ndarray) -> np.ndarray:

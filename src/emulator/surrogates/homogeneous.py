@@ -102,7 +102,7 @@ class Homogeneous:
         elements, rows, corners = self._places
         point = Point(point_energy(self.scene, theta), stress_and_moduli(self.scene, theta))
         tissue = jax.tree.map(lambda each: each[elements, 0], self.scene.tissue_at(theta))
-        guesses = _GUESSES if self.states.pulls.any() else _GUESSES[:1]
+        guesses = _GUESSES if self.states.pulls.any() else _GUESSES[:0]
         settled, converged = jax.vmap(partial(equilibrium, point, guesses))(
             jnp.asarray(self.states.gradients[elements]),
             jnp.asarray(self.states.pulls[elements]),
@@ -198,7 +198,8 @@ def equilibrium(
 
     Parameters
     ----------
-    guesses : strains (g,) along the pulls, of which the one of least potential is the start.
+    guesses : strains (g,) along the pulls, of which the one of least potential is the start; none
+        where nothing pulls.
     H : the prescribed gradient (3, 3), zero in free directions.
     pulls : the first Piola-Kirchhoff stress along each axis in kPa, (3,).
     axes : the axes (u,) of the stretches that minimise the energy; 3 for none.
@@ -236,12 +237,12 @@ def equilibrium(
         slope = jnp.where(own, jnp.einsum("ij,ija->a", stress, along), 0.0)
         return potential(d), slope, stiffness
 
-    # Exponential laws overshoot in strain: a pull's equilibrium is looked for near the best guess.
-    along = jnp.where(own, jnp.append(pulls, 0.0)[jnp.minimum(axes, 3)], 0.0)
-    along = along / jnp.maximum(jnp.max(jnp.abs(along)), jnp.finfo(along.dtype).tiny)
-    tried = start + (1.0 + start) * jnp.asarray(guesses)[:, None] * along
-    energies = jax.vmap(potential)(tried)
-    start = tried[jnp.argmin(jnp.where(jnp.isfinite(energies), energies, jnp.inf))]
+    if len(guesses):  # exponential laws overshoot in strain: begin near a pull's equilibrium
+        along = jnp.where(own, jnp.append(pulls, 0.0)[jnp.minimum(axes, 3)], 0.0)
+        along = along / jnp.maximum(jnp.max(jnp.abs(along)), jnp.finfo(along.dtype).tiny)
+        tried = start + (1.0 + start) * jnp.asarray(guesses)[:, None] * along
+        energies = jax.vmap(potential)(tried)
+        start = tried[jnp.argmin(jnp.where(jnp.isfinite(energies), energies, jnp.inf))]
     found = jax.lax.stop_gradient(_minimised(linearised, start))
     # One more step, whose stiffness is a constant, has the derivative of the equilibrium.
     stress = jax.grad(point.energy)(gradient(found.d), tissue) - jnp.diag(pulls)
