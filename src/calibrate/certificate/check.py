@@ -115,7 +115,7 @@ def examine(
     """
     count, most = _checked_counts(draws, at_most, mesh)
     stages = Stages(show=False) if stages is None else stages
-    predictive = Predictive(posterior.model, posterior.data)
+    predictive = Predictive(posterior.model, posterior.data, posterior.draws())
     rng = np.random.default_rng(seed)
     z = predictive.unconstrain(posterior.draws())
     with (

@@ -129,6 +129,7 @@ def evidence_of(
     pool, figures = tests.pool, figures_of(posterior, tests)
     missed = missed_by(tests, Runs.joined([training, tests.runs]))
     means, valid = pool.predictive.means(at_draws.z)
+    errors = (means - at_draws.means)[valid & at_draws.converged]
     z = pool.z[pool.resampled(_DRAWS, rng)]
     return Evidence(
         *figures,
@@ -136,7 +137,7 @@ def evidence_of(
         physics_of(at_draws, training, tests),
         tail_of(tests, missed, modes),
         misfits(pool.predictive, pool.correction, z, key_from(rng)),
-        in_noise_sd(posterior.model, (means - at_draws.means)[valid & at_draws.converged]),
+        in_noise_sd(posterior.model, errors, posterior.draws()),
         box=tuple(posterior.box_ends()),
     )
 

@@ -235,8 +235,8 @@ def _corrections_by(predictive: Predictive, runs: Runs) -> CorrectionBy:
     def fitted(errors: np.ndarray, like: Correction | None = None) -> Correction:
         if usable.sum() < x.shape[1] + 2:
             return no_correction(len(runs.z), x.shape[1], errors.shape[1])
-        scales, rows = predictive.scales, len(runs.z)
-        return fit_correction(x[usable], errors[usable], scales, rows, like=like)
+        likely, rows = runs.likely[usable], len(runs.z)
+        return fit_correction(x[usable], errors[usable], predictive.scales, rows, likely, like)
 
     on_mesh = fitted(errors_on_mesh)
 

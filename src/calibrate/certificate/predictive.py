@@ -14,23 +14,24 @@ solved, and the map misses the data's means by :math:`D`. Between them
 .. math:: d(x) = k(x, X) (k(X, X) + \tau^2 I)^{-1} D, \quad
     k(x, x') = v (1 + x \cdot x') + \exp(-|x - x'|^2 / 2 \ell^2)
 
-for all data at once, with theta standardised by its prior, :math:`x`, and a linear trend of wide
-prior :math:`v`. :math:`\ell` and :math:`\tau` minimise leave-one-out errors, which for a Gaussian
+for all data at once, with theta standardised, :math:`x`, and a linear trend of wide prior
+:math:`v`. :math:`\ell` and :math:`\tau` minimise leave-one-out errors, which for a Gaussian
 process have a closed form (Rasmussen and Williams 2006, Eq. 5.10-5.12). The size of these errors
 also sets the scale :math:`a^2` of the process's variance, in squared noise sd,
 
 .. math:: v(x) = a^2 (k(x, x) + \tau^2 - k(x, X) (k(X, X) + \tau^2 I)^{-1} k(X, x))
 
 A wrong correction costs precision, not correctness: :math:`v` only says where to solve FEM next,
-and FEM at fresh points tests what the correction predicts (:mod:`calibrate.certificate.check`). One
-of the candidates is no correction at all, because a process that a bump far from the posterior
-spoils everywhere is worse than none.
+and FEM at fresh points tests what the correction predicts (:mod:`calibrate.certificate.check`). A
+bump far from the posterior may spoil a process everywhere. So there are three candidates, a process
+of all points, one of those that FEM finds likely, and none; leave-one-out errors at the likely ones
+decide.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import product
 from typing import Any, NamedTuple
@@ -51,6 +52,7 @@ from calibrate.samplers.density import (
     without_nan,
 )
 from calibrate.statistical_model import Data, Model
+from calibrate.statistical_model.errors import noise_sds
 from emulator.core.gaussian_process import squared_exponential
 
 _LENGTHS = (0.25, 0.5, 1.0, 2.0, 4.0)  # correlation lengths that are compared, in prior sd
@@ -63,29 +65,37 @@ _WIDTH_DRAWS = 512  # draws of the prior, from which the scale of theta's featur
 class Correction(NamedTuple):
     r"""A fitted Gaussian process; all zeros for no correction.
 
-    at : the features (n, q) of theta where FEM was solved; rows of zeros may be padding.
+    at : the features (n, q) of theta where FEM was solved, standardised; rows of zeros may be
+        padding.
     weights : the weights of the kernel (n, m), zero in rows of padding.
     inverse : the inverse of the kernel matrix (n, n).
+    centre, width : the mean and sd (q,) of the features, by which they are standardised.
     length, nugget, scale : :math:`\\ell`, :math:`\\tau^2` and :math:`a^2` of the kernel.
+    local : whether it was fitted to likely points alone.
     """
 
     at: np.ndarray
     weights: np.ndarray
     inverse: np.ndarray
+    centre: np.ndarray
+    width: np.ndarray
     length: float
     nugget: float
     scale: float
+    local: bool
 
 
 def no_correction(rows: int, features: int, data: int) -> Correction:
     """Return the correction that is zero, of the shape of one fitted to ``rows`` points."""
     at, weights, inverse = (np.zeros((rows, width)) for width in (features, data, rows))
-    return Correction(at, weights, inverse, length=1.0, nugget=0.0, scale=0.0)
+    centre, width = np.zeros(features), np.ones(features)
+    return Correction(at, weights, inverse, centre, width, 1.0, 0.0, 0.0, local=False)
 
 
 def correct(correction: Correction, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the correction (m,) at features ``x`` (q,), and its variance in squared noise sd."""
     c = correction
+    x = (x - c.centre) / c.width
     distance = jnp.sum((c.at - x) ** 2, axis=-1)
     kernel = _TREND * (1.0 + c.at @ x) + squared_exponential(distance / c.length**2)
     prior_variance = _TREND * (1.0 + x @ x) + 1.0 + c.nugget
@@ -107,28 +117,54 @@ def fit_correction(
     likely: np.ndarray | None = None,
     like: Correction | None = None,
 ) -> Correction:
-    """Fit the Gaussian process, or return no correction where that has smaller errors.
+    """Return the best of a Gaussian process of all points, one of likely points, and none.
 
     Parameters
     ----------
     x : the features (n, q) at which FEM was solved.
     errors : FEM's data less the map's there, (n, m).
-    scales : the noise level (m,) of each datum, the unit of leave-one-out errors.
+    scales : the noise sd (m,) of each datum, the unit of leave-one-out errors.
     rows : the number of points to which the result is padded with zeros, so that programs are
         compiled once.
-    likely : (n,) bool, points at which the process has to be better than no correction; all by
-        default.
-    like : the correction whose kernel is taken as it is; by default it is searched for.
+    likely : (n,) bool, points that FEM finds likely, which decide what is best; all by default.
+    like : the correction whose points and kernel are taken; by default they are searched for.
     """
-    kernels = list(product(_LENGTHS, _NUGGETS))
+    every = np.ones(len(x), dtype=bool)
+    likely = every if likely is None or not likely.any() else likely
+    parts, kernels = [every], list(product(_LENGTHS, _NUGGETS))
+    # Where data say much, points far away miss by so much more that they hide what is near.
+    if x.shape[1] + 2 <= likely.sum() < len(x):
+        parts.append(likely)
     if like is not None and like.nugget > 0.0:
-        kernels = [(like.length, like.nugget)]
-    none, fitted = (no_correction(rows, x.shape[1], errors.shape[1]) for _ in range(2))
+        parts, kernels = parts[-1:] if like.local else parts[:1], [(like.length, like.nugget)]
+    squared_errors = np.mean((errors / scales) ** 2, axis=1)
+    best = no_correction(rows, x.shape[1], errors.shape[1])._replace(
+        scale=float(np.mean(squared_errors / (_TREND * (x**2).sum(axis=1) + _TREND + 1.0)))
+    )
+    smallest = np.log(squared_errors[likely] + _NEGLIGIBLE**2).mean()
+    for used in parts:
+        fitted, loss = _fitted(x[used], errors[used], scales, rows, likely[used], kernels)
+        if loss < smallest:
+            best, smallest = fitted._replace(local=used is likely), loss
+    return best
+
+
+def _fitted(
+    x: np.ndarray,
+    errors: np.ndarray,
+    scales: np.ndarray,
+    rows: int,
+    likely: np.ndarray,
+    kernels: list[tuple[float, float]],
+) -> tuple[Correction, float]:
+    """Return the process of these points, and the mean log of its errors where it is ``likely``."""
+    width = x.std(axis=0)
+    centre, width = x.mean(axis=0), np.where(width > 0.0, width, 1.0)
+    x = (x - centre) / width
+    fitted = no_correction(rows, x.shape[1], errors.shape[1])._replace(centre=centre, width=width)
     fitted.at[: len(x)] = x
     linear = _TREND * (1.0 + x @ x.T)
-    squared_errors = np.mean((errors / scales) ** 2, axis=1)
-    test_rows = slice(None) if likely is None or not likely.any() else likely
-    smallest_loss, loss_where_likely = np.inf, np.inf
+    smallest, where_likely = np.inf, np.inf
     distances = ((x[:, None] - x) ** 2).sum(axis=-1)
     for length, nugget in kernels:
         kernel = linear + squared_exponential(distances / length**2) + nugget * np.eye(len(x))
@@ -138,16 +174,13 @@ def fit_correction(
         square = np.mean((weights / np.diag(inverse)[:, None] / scales) ** 2, axis=1)
         variance = 1.0 / np.diag(inverse)
         # Geometric mean over the points, so that the prior's corners do not decide.
-        loss = np.log(square + _NEGLIGIBLE**2).mean()
-        if loss < smallest_loss:
-            smallest_loss = loss
-            loss_where_likely = np.log(square[test_rows] + _NEGLIGIBLE**2).mean()
+        losses = np.log(square + _NEGLIGIBLE**2)
+        if losses.mean() < smallest:
+            smallest, where_likely = losses.mean(), losses[likely].mean()
             fitted.weights[: len(x)], fitted.inverse[: len(x), : len(x)] = weights, inverse
             scale = float(np.mean(square / variance))
             fitted = fitted._replace(length=length, nugget=nugget, scale=scale)
-    if loss_where_likely < np.log(squared_errors[test_rows] + _NEGLIGIBLE**2).mean():
-        return fitted
-    return none._replace(scale=float(np.mean(squared_errors / (np.diag(linear) + 1.0))))
+    return fitted, where_likely
 
 
 class Evaluated(NamedTuple):
@@ -174,10 +207,14 @@ def _compiled(method: Callable[..., Any]) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Predictive:
-    """Prior, likelihoods and predictions of a model given its data, at points z (s, p)."""
+    """Prior, likelihoods and predictions of a model given its data, at points z (s, p).
+
+    draws : draws (s,) of the posterior by name, of which noise that is inferred is taken.
+    """
 
     model: Model
     data: Data
+    draws: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     @cached_property
     def _density(self) -> Density:
@@ -273,11 +310,9 @@ class Predictive:
 
     @cached_property
     def scales(self) -> np.ndarray:
-        """Noise level (m,) of each of the flat data, in its unit."""
-        levels = {
-            name: np.full(part.shape, self.model.noise[name].upper_sd)
-            for name, part in self.model.observe.parts.items()
-        }
+        """Noise sd (m,) of each of the flat data, in its unit."""
+        sds = noise_sds(self.model, self.draws)
+        levels = {n: np.full(part.shape, sds[n]) for n, part in self.model.observe.parts.items()}
         return np.asarray(ravel_pytree(levels)[0])
 
     @cached_property

@@ -69,6 +69,11 @@ class Runs(NamedTuple):
         """Whether FEM converged in each run, (s,)."""
         return np.isfinite(self.means).all(axis=1)
 
+    @property
+    def likely(self) -> np.ndarray:
+        """Whether FEM finds the data as likely as near the best run, (s,)."""
+        return self.fem > least_likely(self.fem.max(), self.z.shape[1], _LIKELY)
+
     @classmethod
     def joined(cls, parts: Iterable[Runs]) -> Runs:
         """Return the runs of all parts, one part after the other."""
@@ -129,9 +134,8 @@ def correction_from(runs: Runs, predictive: Predictive, rows: int) -> Correction
     usable = valid & runs.converged
     if usable.sum() < x.shape[1] + 2:
         return no_correction(rows, x.shape[1], means.shape[1])
-    likely = runs.fem > least_likely(runs.fem.max(), runs.z.shape[1], _LIKELY)
     errors = (runs.means - means)[usable]
-    return fit_correction(x[usable], errors, predictive.scales, rows, likely[usable])
+    return fit_correction(x[usable], errors, predictive.scales, rows, runs.likely[usable])
 
 
 @dataclass(frozen=True, eq=False)

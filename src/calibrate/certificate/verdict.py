@@ -182,7 +182,13 @@ def _mesh(mesh: MeshChange) -> tuple[bool | None, list[Finding]]:
         remedy = _LEARN_GRIPS
     elif mesh.widened:
         remedy = "learn the error of the mesh from more runs, or emulate the finer mesh"
-    return False, [(f"{finer} the {each}", remedy) for each in decisive]
+    return False, _together([f"{finer} the {decisive[0]}", *decisive[1:]], remedy)
+
+
+def _together(words: list[str], remedy: str) -> list[Finding]:
+    """Return the first of figures with their remedy, and all others in one line."""
+    others = [(f"and the {', the '.join(words[1:])}", "")] if words[1:] else []
+    return [(words[0], remedy), *others]
 
 
 def _agreement(evidence: Evidence) -> tuple[Verdict, list[Finding]]:
@@ -203,11 +209,12 @@ def _agreement(evidence: Evidence) -> tuple[Verdict, list[Finding]]:
         return "undecided", [(close, _MORE + some)]
     repaired = all_within(evidence.corrected.comparisons())
     if repaired:
-        return "reweight", [(words, "use the reweighted posterior") for words, _, _ in decisive]
+        words = [words for words, _, _ in decisive]
+        return "reweight", _together(words, "use the reweighted posterior")
     verdict: Verdict = "undecided" if repaired is None else "not certified"
     remedy = _MORE if repaired is None else "train a better map"
-    still = "and reweighting does not repair it"
-    return verdict, [(f"{words}, {still}", remedy) for words, _, _ in decisive]
+    first, *others = (words for words, _, _ in decisive)
+    return verdict, _together([f"{first}, and reweighting does not repair it", *others], remedy)
 
 
 def _weights(tail: Tail) -> tuple[Verdict, list[Finding]] | None:

@@ -119,6 +119,10 @@ class Noise(ABC):
         """
         return self.scales[0].upper
 
+    def size(self, values: Mapping[str, jax.Array]) -> jax.Array:
+        """Return the sd of one number of the data; ``values`` are the inferred scales by name."""
+        return jnp.sqrt(sum(jnp.square(scale.value(values)) for scale in self.scales))
+
     def at(self, sites: Sites | None) -> Self:
         """Return the noise of data measured at ``sites``; independent noise is the same everywhere.
 

@@ -25,8 +25,7 @@ from emulator.scenes.tube import Tube
 
 _MODULI = (0.005, 3.0)  # range of a modulus, as a share of the largest stress over its strain
 _EXPONENTS = (0.1, 50.0)
-_KAPPA = 1000.0  # bulk modulus, likewise
-_KAPPA_OF_WALL = 1e4  # of a tube, where fibres are stretched most: 1000 changes stresses by 0.4 %
+_KAPPA = 1e4  # bulk modulus, likewise: 1000 changes stresses of stretched fibres by 0.4 %
 _NOISE = 0.03  # scale of both sds of the noise, as a share of the largest stress
 _GRIPS = (
     "# [grips]   # how the piece was held, so that the certificate says what that does",
@@ -207,7 +206,7 @@ def _scene_text(law: Law, table: str, axes: list[str], slope: float, tube: Tube 
         ]
     constants = [f"{name} = 1.0" for name in layers[:1]]
     if any(quantity.name == "kappa" for quantity in law.quantities):
-        kappa = (_KAPPA if tube is None else _KAPPA_OF_WALL) * slope
+        kappa = _KAPPA * slope
         constants.append(f"kappa = {kappa:.2g}   # kPa")
     lines += ["", "[constants]", *constants] if constants else []
     if tube is None:

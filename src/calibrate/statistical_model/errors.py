@@ -223,23 +223,39 @@ def map_errors(
         seen = (observe(each[:, observe.nodes], thetas) for each in (u, u - off))
         error = jnp.subtract(*(ravel_pytree(each)[0] for each in seen))
         errors += [error] if bool(jnp.all(jnp.isfinite(error))) else []
-    return in_noise_sd(model, np.array(errors))
+    return in_noise_sd(model, np.array(errors), draws)
 
 
-def in_noise_sd(model: Model, errors: np.ndarray) -> dict[str, float]:
+def noise_sds(model: Model, draws: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Return the sd of one number of each observation by noise, in its unit, by name.
+
+    draws : draws (s,) by the unknown's name; an inferred sd is the median of its draws.
+    """
+    return {
+        name: float(noise.size({s: jnp.median(draws[site]) for s, site in sites.items()}))
+        for (name, noise), sites in zip(
+            model.noise.items(), model.noise_sites.values(), strict=True
+        )
+    }
+
+
+def in_noise_sd(
+    model: Model, errors: np.ndarray, draws: Mapping[str, np.ndarray]
+) -> dict[str, float]:
     """Return the size of the map's errors in noise sd, by the observation's name.
 
     Root mean squares over its numbers, medians over draws; empty if the likelihood allows for them.
 
     errors : the map's data less FEM's at draws, flat (s, m).
+    draws : draws (s,) by the unknown's name, of which an inferred noise sd is taken.
     """
     if not len(errors) or (model.error is not None and model.error.amplitude is not None):
         return {}
     unravel = ravel_pytree({name: jnp.zeros(n) for name, n in model.observe.shapes.items()})[1]
-    sizes = {}
+    sizes, sds = {}, noise_sds(model, draws)
     for name, each in jax.vmap(unravel)(jnp.asarray(errors)).items():
         square = np.square(np.asarray(each).reshape(len(errors), -1))
-        sizes[name] = float(np.median(np.sqrt(square.mean(axis=1))) / model.noise[name].upper_sd)
+        sizes[name] = float(np.median(np.sqrt(square.mean(axis=1))) / sds[name])
     return sizes
 
 

@@ -50,12 +50,13 @@ def test_it_matches_a_gaussian_process_solved_otherwise():
     x, new = points(12), points(3, 1)
     errors = np.sin(x @ np.ones((2, 1)))
     correction = fit_correction(x, errors, np.ones(1), 12)
+    found = at(correction, new)
+    x, new = ((each - x.mean(axis=0)) / x.std(axis=0) for each in (x, new))
     kernel = lambda a, b: (
         1e2 * (1 + a @ b.T) + np.exp(-0.5 * ((a[:, None] - b) ** 2).sum(-1) / correction.length**2)
     )
     gaps = [
-        kernel(new, x) @ np.linalg.solve(kernel(x, x) + nugget * np.eye(12), errors)
-        - at(correction, new)
+        kernel(new, x) @ np.linalg.solve(kernel(x, x) + nugget * np.eye(12), errors) - found
         for nugget in (1e-6, 1e-4, 1e-2, 1.0, 1e2)
     ]
     assert min(np.abs(gap).max() for gap in gaps) < 1e-6
@@ -71,3 +72,17 @@ def test_a_bump_far_from_what_is_likely_spoils_nothing():
     assert correction.scale > 0.0  # it is known to be uncertain
     # Wrong where it counts: a poor process is better than none.
     assert np.abs(at(fit_correction(x, errors, np.ones(2), 60, far), x)).max() > 1.0
+
+
+def test_errors_far_away_do_not_hide_those_of_a_narrow_posterior():
+    """Data that say much: the map misses by 0.1 where it counts, and by 1e9 at the prior's ends."""
+    near, far = 0.01 * points(30) + 0.3, points(20, 1)
+    x, small = np.concatenate([near, far]), lambda x: 0.1 * linear(30.0 * (x - 0.3))
+    errors = np.concatenate([small(near), 1e9 * linear(far) ** 2])
+    correction = fit_correction(x, errors, np.ones(2), 60, np.arange(50) < 30)
+    new = 0.01 * points(40, 2) + 0.3
+    assert correction.local
+    np.testing.assert_allclose(at(correction, new), small(new), atol=1e-4)
+    # A finer mesh changes the errors, but neither the points nor the kernel.
+    again = fit_correction(x, errors + 0.1, np.ones(2), 60, np.arange(50) < 30, like=correction)
+    np.testing.assert_allclose(at(again, new), small(new) + 0.1, atol=1e-4)

@@ -208,3 +208,8 @@ def test_a_newton_step_tells_what_the_map_misses(beam, simulator, aware):
     assert told == {"displacement": pytest.approx(np.sqrt(np.mean(off**2)) / NOISE, rel=0.1)}
     assert told["displacement"] > 1.0
     assert map_errors(replace(model, error=aware.error), simulator, draws) == {}
+    # Noise that is inferred, and that correlates: the sd of one number, as the draws have it.
+    noise = cal.CorrelatedNoise(length=20.0, sd_scale=100.0, spatial_sd=0.4 * NOISE)
+    model = cal.model(forward, cal.nodal_displacements(beam, NODES), noise)
+    inferred = map_errors(model, simulator, draws | {"noise_sd": np.full(20, 0.3 * NOISE)})
+    assert inferred["displacement"] == pytest.approx(2.0 * told["displacement"])
