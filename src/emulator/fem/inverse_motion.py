@@ -61,7 +61,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.fem.assembly import System
-from emulator.fem.compiled import compiled
 from emulator.fem.condensation import (
     Condensed,
     Couplings,
@@ -79,7 +78,6 @@ from emulator.fem.energy import (
     nodal_vectors,
     pair_matrices,
     point_energy,
-    volume_ratio,
     with_volume_change,
 )
 from emulator.fem.material_point import stress_and_moduli
@@ -304,15 +302,3 @@ class InverseSystem(System):
         """Return the derivatives (b, 3a, 3a) of the blocks' forces in w, mN/mm."""
         volumes = consistent(self.scene, u, theta)
         return linearise(self.scene, u, volumes, theta).tangent
-
-    @compiled
-    def least_volume_ratio(self, u: jax.Array) -> jax.Array:
-        """Return the smallest ratio of volumes, of points and of elements between their corners.
-
-        A quadratic element may be inverted at its corners and not at its quadrature points, and
-        no mesh may have one.
-        """
-        mesh = self.scene.mesh
-        before, after = (x[mesh.corners] for x in (jnp.asarray(mesh.nodes), mesh.nodes + u))
-        old, new = (jax.vmap(determinant)(x[:, 1:] - x[:, :1]) for x in (before, after))
-        return jnp.minimum(jnp.min(volume_ratio(self.scene, u)), jnp.min(new / old))

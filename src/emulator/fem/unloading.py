@@ -53,6 +53,7 @@ from emulator.fem.linear import find_solver
 from emulator.fem.newton import NewtonOptions, largest_admissible
 from emulator.fem.solution import Solution, Status
 from emulator.geometry.discretisation import Blocks
+from emulator.geometry.mesh import signed_volumes
 from emulator.mechanics.kinematics import cofactor, determinant
 from emulator.scenes.scene import Scene
 from emulator.scenes.tissue import Tissue
@@ -351,7 +352,14 @@ def scene_at_rest(scene: Scene, w: jax.Array) -> Scene:
     if directions is not None:
         values = np.asarray(directions)
         fibres, sheets = (values, None) if values.ndim == 3 else (values[:, :, 0], values[:, :, 1])
-    mesh = replace(scene.mesh, nodes=scene.mesh.nodes + np.asarray(w))
+    nodes, corners = scene.mesh.nodes + np.asarray(w), scene.mesh.corners
+    if inverted := int((signed_volumes(nodes, corners) <= 0.0).sum()):
+        raise InputError(
+            f"scene '{scene.name}': {inverted} of {len(corners)} elements of the stress-free mesh "
+            "are inverted at their corners, where no stress is evaluated; mesh with rounder "
+            "elements, or let a map unload the body (loaded_by), which needs no such mesh"
+        )
+    mesh = replace(scene.mesh, nodes=nodes)
     # No rule made these directions, and no name says how the mesh was made.
     return replace(scene, mesh=mesh, fibres=fibres, sheets=sheets, fibre_rule=None, origin={})
 
