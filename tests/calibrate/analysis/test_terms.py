@@ -190,6 +190,7 @@ def test_a_set_that_needs_a_negative_modulus_is_not_taken():
     assert found.probabilities["a"] > 0.99
 
 
+@pytest.mark.slow
 def test_a_test_without_shear_says_nothing_of_shear():
     rows = slice(24)
     given = states({"stretch_x": GIVEN.gradients[rows, 0, 0] + 1.0,

@@ -86,6 +86,7 @@ def test_no_density_has_no_weights():
     assert effective(weights) == 0.0
 
 
+@pytest.mark.slow
 def test_tests_are_where_they_are_said_to_be(case, predictive):
     """Distinct points that tests take in a cell, counted in pool after pool."""
     rng = np.random.default_rng(5)

@@ -155,6 +155,7 @@ def gripped(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_what_grips_do_is_learned_by_one_command(gripped, capsys):
     assert main(["train", "scene.toml", "--out", "grips.safetensors", "--simulations", "10"]) == 0
     assert 'learned = "grips.safetensors" under [grips]' in capsys.readouterr().out

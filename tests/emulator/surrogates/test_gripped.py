@@ -89,6 +89,7 @@ def test_marks_have_moved_as_was_measured(membrane):
     assert at.q[0] > 0.21  # hooks move more than the middle
 
 
+@pytest.mark.slow
 def test_a_thick_layer_between_plates_is_sheared_less_evenly_than_a_thin_one():
     sheared = {"stretch_x": np.ones(2), "stretch_y": np.ones(2), "shear_xy": [0.1, 0.2]}
 
