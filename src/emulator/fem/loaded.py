@@ -75,12 +75,13 @@ class LoadedEquilibrium:
     def solve(self, theta: jax.Array, start: jax.Array | None) -> Solution:
         """Return the equilibrium at ``theta`` (p,), its displacement (n, 3) in mm from the mesh.
 
-        It is sought from ``start`` (n, 3) mm, also from the mesh, or from the stress-free shape.
+        It is sought from ``start`` (n, 3) mm, also from the mesh, or from the mesh itself, which is
+        the equilibrium of the image's loads.
         Where that is not found, the status is why, and the displacement zero.
         """
         unloaded = self.unloaded(theta)
         w = unloaded.displacement
-        begin = jnp.zeros_like(w) if start is None else start - w
+        begin = -w if start is None else start - w
         loaded = self._load(theta, w, jax.lax.stop_gradient(begin))
 
         def select(if_unloaded: jax.Array, otherwise: jax.Array | float) -> jax.Array:
