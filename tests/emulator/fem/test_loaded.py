@@ -70,8 +70,12 @@ def test_a_solve_unloads_and_loads(simulator, ventricle):
 
 @pytest.mark.slow
 def test_at_the_pressure_of_the_image_nothing_moves(simulator, imaged):
-    still = simulator.solve(theta_of(0.8, 0.8)).require_converged()
+    theta = theta_of(0.8, 0.8)
+    at_rest = LoadedEquilibrium(imaged, em.NewtonOptions(), "suitesparse").unloaded(theta)
+    still = simulator.solve(theta, at_rest.displacement).require_converged()
     assert float(jnp.abs(still.displacement).max()) < 1e-8
+    assert int(still.iterations) > int(at_rest.iterations)  # loaded from rest
+    assert not np.asarray(simulator.solve(theta).displacement).any()  # begun at the mesh
     # The cavity of the image, and less of it under less pressure.
     cavity = Cavity(imaged.mesh, "endocardium")
     u = simulator.solve(theta_of(0.5, 0.8)).displacement

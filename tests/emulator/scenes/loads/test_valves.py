@@ -12,6 +12,7 @@ from emulator.core.errors import InputError
 from emulator.fem.assembly import System
 from emulator.fem.energy import local_terms
 from emulator.fem.inverse_motion import InverseSystem
+from emulator.fem.loaded import LoadedEquilibrium
 from emulator.fem.unloading import scene_at_rest
 from emulator.geometry.facets import Cavity
 from emulator.geometry.generators.ellipsoid import human_ventricle
@@ -84,15 +85,51 @@ def test_valves_pull_on_their_rims():
     assert abs(lifts[0]) < 0.1 * abs(lifts[1])  # balanced pressure: springs carry no net force
 
 
+def both_ventricles():
+    """A coarse heart imaged under both pressures, on springs along its base and its outside."""
+    scene = em.scenes.biventricle(4, 12, (1, 1), order=1)
+    return replace(
+        scene,
+        loads=(ValvePressure("lv_endocardium"),
+               ValvePressure("rv_endocardium", parameter="right_pressure")),
+        supports=(ElasticSupport("base", 0.5), ElasticSupport("epicardium", 0.1, direction="normal")),
+        parameters=(em.Parameter("a", "kPa", 0.5, 3.0), em.Parameter("pressure", "kPa", 0.1, 2.0),
+                    em.Parameter("right_pressure", "kPa", 0.05, 0.6),
+                    em.Parameter("imaged", "kPa", 0.1, 1.0)),
+        constants={"kappa": 25.0, "b": 4.0, "a_f": 10.0, "b_f": 4.0, "imaged_right": 0.15},
+        loaded_by={"pressure": "imaged", "right_pressure": "imaged_right"}, origin={},
+    )  # fmt: skip
+
+
 @pytest.mark.slow
-def test_unloaded_and_loaded_again_it_meets_its_mesh():
-    scene = replace(heart(2), parameters=(
-        em.Parameter("mu", "kPa", 5.0, 20.0), em.Parameter("pressure", "kPa", 0.1, 1.5),
-    ), constants={"kappa": 50.0, "imaged": 0.8}, loaded_by={"pressure": "imaged"})  # fmt: skip
-    theta = scene.theta(mu=12.0, pressure=0.8)
-    solution = em.Simulator(scene).solve(theta)
-    assert solution.converged
-    np.testing.assert_allclose(solution.displacement, 0.0, atol=1e-8)
+def test_both_ventricles_unloaded_and_loaded_again_meet_their_mesh():
+    scene = both_ventricles()
+    loaded = LoadedEquilibrium(scene, em.NewtonOptions(), "suitesparse")
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        a, imaged = rng.uniform(0.5, 3.0), rng.uniform(0.1, 1.0)
+        theta = scene.theta(a=a, pressure=imaged, imaged=imaged, right_pressure=0.15)
+        at_rest = loaded.unloaded(theta).require_converged().displacement
+        again = loaded.solve(theta, at_rest).require_converged()  # from rest
+        np.testing.assert_allclose(again.displacement, 0.0, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_slopes_of_both_volumes_are_those_of_differences():
+    scene, step = both_ventricles(), 1e-4
+    simulator = em.Simulator(scene)
+    theta = scene.theta(a=1.2, pressure=1.1, imaged=0.5, right_pressure=0.3)
+    for name in ("lv_endocardium", "rv_endocardium"):
+        cavity = Cavity(scene.mesh, name)
+
+        def volume(theta, cavity=cavity):
+            return cavity(simulator.solve(theta).displacement[cavity.nodes])
+
+        slopes = jax.grad(volume)(theta)
+        for k, size in enumerate(theta):
+            along = step * float(size) * jnp.eye(len(theta))[k]
+            difference = (volume(theta + along) - volume(theta - along)) / (2.0 * along[k])
+            assert float(slopes[k]) == pytest.approx(float(difference), rel=1e-6)
 
 
 def test_what_it_refuses():
