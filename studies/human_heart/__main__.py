@@ -12,17 +12,17 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import jax
-import jax.numpy as jnp
-import numpy as np
-from studies.common.output import Case, Results, parser, run, save
+from studies.common.output import Case, Results, parser, run
 from studies.human_heart.bands import KEPT_APART, bands_of, judged
 from studies.human_heart.figures import draw
-from studies.human_heart.heart import FRAMES, IMAGED, SURFACES, scene_of, surfaces_of
+from studies.human_heart.heart import FRAMES, SURFACES, scene_of, surfaces_of
+from studies.human_heart.twins import coverage, twin, unloaded_volumes
 
 import calibrate as cal
 import emulator as em
@@ -36,7 +36,7 @@ HERE = Path(__file__).parent
 SEED = 18
 LENGTH = 25.0  # mm, over which what a fitted surface misses correlates
 VOLUME_SD = 3.0  # mL
-POINTS, RUNS = 60, 32  # of a surface, as data; FEM runs of the emulator
+POINTS, RUNS, TWINS = 60, 44, 20  # of a surface, as data; FEM runs of the emulator; hearts
 # Pressures by frame, mmHg: mean and sd of the left one; the right one is a fifth to a quarter.
 PRESSURES = {"f016": (5.0, 2.0), "f020": (5.0, 2.0), "f022": (6.0, 2.5), "f024": (8.0, 4.0)}
 AT_REST = (5.0, 2.0)  # in the frame that is meshed
@@ -58,16 +58,16 @@ def prior_of(scene: Scene, frames: tuple[str, ...]) -> dict[str, Any]:
     return prior
 
 
-def posterior_of(
-    scene: Scene, forward: Any, data_folder: Path, frames: tuple[str, ...], quick: bool
-) -> cal.Posterior:
-    """The posterior of material, supports and pressures from these frames."""
+def model_of(
+    scene: Scene, forward: Any, folder: Path, frames: tuple[str, ...], quick: bool
+) -> tuple[cal.Model, Any]:
+    """The model of these frames' surfaces and volumes, and their data."""
     observe, data = frame_data(
         scene,
         {
             f"{name}@{frame}": surface
             for frame in frames
-            for name, surface in surfaces_of(data_folder, frame).items()
+            for name, surface in surfaces_of(folder, frame).items()
         },
         12 if quick else POINTS,
     )
@@ -76,28 +76,43 @@ def posterior_of(
         for name in SURFACES
     }
     noise |= {f"volume:{name}": cal.GaussianNoise(sd=VOLUME_SD) for name in SURFACES[:2]}
-    model = cal.model(forward, observe, noise, prior_of(scene, frames))
-    model, data = model.given(data)
-    draws = 50 if quick else 500
-    options = cal.NUTSOptions(warmup=draws, draws=draws, chains=2, rounds=1 if quick else 4)
+    return cal.model(forward, observe, noise, prior_of(scene, frames)), data
+
+
+def posterior_of(model: cal.Model, data: Any, quick: bool) -> cal.Posterior:
+    """The posterior of material, supports and pressures."""
+    draws = 50 if quick else 300
+    options = cal.NUTSOptions(warmup=draws, draws=draws, chains=2, rounds=1 if quick else 3)
     return cal.sample(model, data, sampler="nuts", options=options, seed=SEED, predictions=False)
 
 
-def told_by(found: cal.Posterior) -> Case:
+def told_by(found: cal.Posterior, scene: Scene) -> Case:
     """Means, sds and 90 % intervals of all unknowns, and the quality of the draws."""
+    volumes = {
+        name: {"mean": float(v.mean()), "sd": float(v.std())}
+        for name, v in unloaded_volumes(found, scene).items()
+    }
     return {
         "posterior": found.summary(),
+        "unloaded_ml": volumes,
         "divergences": found.divergences,
         "box": [str(end) for end in found.box_ends()],
     }
 
 
-def emulated(scene: Scene, folder: Path, quick: bool) -> tuple[Any, Case]:
-    """The emulator of unloading and loading; one that is in ``folder`` is kept."""
-    plan = replace(recipe("mechanics"), simulations=12 if quick else RUNS, order=1, seed=SEED)
+def emulated(scene: Scene, folder: Path, quick: bool) -> tuple[em.Emulator, Case]:
+    """The emulator of unloading and loading, and its error; one that is in ``folder`` is kept."""
     began = perf_counter()
-    emulator = train(scene, plan, folder, progress=True)
-    return emulator, {"seconds": perf_counter() - began, "runs": plan.simulations}
+    if not (folder / "emulator.json").is_file():
+        plan = replace(recipe("mechanics"), simulations=12 if quick else RUNS, order=1, seed=SEED)
+        emulator = train(scene, plan, folder, progress=True)
+        em.save_emulator(emulator, folder)
+    emulator = em.load(folder, scene)
+    return emulator, {
+        "nodes": len(scene.mesh.nodes),
+        "seconds": perf_counter() - began,
+        "record": emulator.record.get("discrepancy"),
+    }
 
 
 def main() -> None:
@@ -106,6 +121,7 @@ def main() -> None:
     words.add_argument("--data", type=Path, help="folder of the surfaces")
     words.add_argument("--judge", type=Path, metavar="DIR", help="folder of frames kept apart")
     words.add_argument("--keep", type=Path, help="folder that keeps the emulator")
+    words.add_argument("--twins", type=int, default=TWINS, help=f"number of twins ({TWINS})")
     arguments = words.parse_args()
     if arguments.judge is not None:
         there = json.loads((arguments.out / "results.json").read_text())
@@ -118,13 +134,15 @@ def main() -> None:
     keep = arguments.keep or arguments.out / "emulator"
     scene = scene_of(data, keep.parent)
     results = Results(arguments.out, SEED, again=arguments.again, settings={"quick": quick})
-    forward, trained = emulated(scene, keep, quick)
-    results.case("emulator", lambda: {"nodes": len(scene.mesh.nodes), **trained})
+    emulator, trained = emulated(scene, keep, quick)
+    forward = emulator.cache()
+    results.case("emulator", lambda: trained)
 
     def of_frames(frames: tuple[str, ...], judge: tuple[str, ...]) -> Case:
         began = perf_counter()
-        found = posterior_of(scene, forward, data, frames, quick)
-        case = told_by(found)
+        model, given = model_of(scene, forward, data, frames, quick)
+        found = posterior_of(*model.given(given), quick)
+        case = told_by(found, scene)
         case["bands"] = bands_of(found, scene, forward, quick)
         case["judged"] = judged(case["bands"], data, judge)
         case["seconds"] = perf_counter() - began
@@ -137,7 +155,14 @@ def main() -> None:
         case = results.case(f"without {frame}", lambda o=others, f=frame: of_frames(o, (f,)))
         case.pop("bands", None)
         jax.clear_caches()
-    results.write()
+    model, _ = model_of(scene, forward, data, FRAMES, quick)
+    twins = [
+        results.case(
+            f"twin {k}", lambda k=k: twin(k, model, scene, partial(posterior_of, quick=quick))
+        )
+        for k in range(1 if quick else arguments.twins)
+    ]
+    results.write(coverage=coverage(twins))
     draw({case["name"]: case for case in results.cases}, arguments.out / "human_heart.png")
 
 

@@ -65,9 +65,7 @@ def bands_of(found: cal.Posterior, scene: Scene, forward: ForwardMap, quick: boo
     for name, part in parts.items():
         bands["points"][name] = part.points.round(4).tolist()
         bands["normals"][name] = part.normals.round(6).tolist()
-    reached = [
-        float(((left.min(axis=0) <= v) & (v <= left.max(axis=0))).mean()) for v in VOLUMES
-    ]
+    reached = [float(((left.min(axis=0) <= v) & (v <= left.max(axis=0))).mean()) for v in VOLUMES]
     bands["share_of_draws_that_reach_it"] = reached
     for name, value in by_name.items():
         sd = _noise(draws, rows, name)

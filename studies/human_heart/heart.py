@@ -56,11 +56,11 @@ scale = "log"
 
 [parameters.pressure]
 unit = "kPa"
-range = [0.2, 1.6]
+range = [0.0, 1.6]
 
 [parameters.right_pressure]
 unit = "kPa"
-range = [0.03, 0.45]
+range = [0.0, 0.45]
 
 [parameters.imaged]
 unit = "kPa"
