@@ -21,11 +21,12 @@ import jax
 from studies.common.output import Case, Results, parser, run
 from studies.human_heart.bands import KEPT_APART, bands_of, judged
 from studies.human_heart.figures import draw
-from studies.human_heart.heart import FRAMES, SURFACES, scene_of, surfaces_of
+from studies.human_heart.heart import FRAMES, LENGTH, SURFACES, scene_of, surfaces_of
 from studies.human_heart.twins import coverage, twin, unloaded_volumes
 
 import calibrate as cal
 import emulator as em
+from calibrate.measurements.collection import observations
 from calibrate.measurements.frames import frame_data
 from emulator.core.errors import InputError
 from emulator.scenes import Scene
@@ -34,8 +35,6 @@ from emulator.training import recipe, train
 
 HERE = Path(__file__).parent
 SEED = 18
-LENGTH = 25.0  # mm, over which what a fitted surface misses correlates
-VOLUME_SD = 3.0  # mL
 POINTS, RUNS, TWINS = 60, 44, 20  # of a surface, as data; FEM runs of the emulator; hearts
 # Pressures by frame, mmHg: mean and sd of the left one; the right one is a fifth to a quarter.
 PRESSURES = {"f016": (5.0, 2.0), "f020": (5.0, 2.0), "f022": (6.0, 2.5), "f024": (8.0, 4.0)}
@@ -61,7 +60,10 @@ def prior_of(scene: Scene, frames: tuple[str, ...]) -> dict[str, Any]:
 def model_of(
     scene: Scene, forward: Any, folder: Path, frames: tuple[str, ...], quick: bool
 ) -> tuple[cal.Model, Any]:
-    """The model of these frames' surfaces and volumes, and their data."""
+    """The model of these frames' surfaces, and their data.
+
+    Volumes are of the same surfaces, and would count them twice.
+    """
     observe, data = frame_data(
         scene,
         {
@@ -71,18 +73,21 @@ def model_of(
         },
         12 if quick else POINTS,
     )
-    noise: dict[str, cal.Noise] = {
+    observe = observations(
+        {n: part for n, part in observe.parts.items() if n.startswith("surface")}
+    )
+    noise = {
         f"surface:{name}": cal.CorrelatedNoise(LENGTH, sd_scale=0.5, spatial_sd_scale=1.5)
         for name in SURFACES
     }
-    noise |= {f"volume:{name}": cal.GaussianNoise(sd=VOLUME_SD) for name in SURFACES[:2]}
-    return cal.model(forward, observe, noise, prior_of(scene, frames)), data
+    model = cal.model(forward, observe, noise, prior_of(scene, frames))
+    return model, {name: data[name] for name in observe.parts}
 
 
 def posterior_of(model: cal.Model, data: Any, quick: bool) -> cal.Posterior:
     """The posterior of material, supports and pressures."""
-    draws = 50 if quick else 300
-    options = cal.NUTSOptions(warmup=draws, draws=draws, chains=2, rounds=1 if quick else 3)
+    draws = 50 if quick else 250
+    options = cal.NUTSOptions(warmup=draws, draws=draws, chains=2, rounds=1 if quick else 2)
     return cal.sample(model, data, sampler="nuts", options=options, seed=SEED, predictions=False)
 
 

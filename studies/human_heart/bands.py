@@ -2,7 +2,8 @@
 
 A draw of the posterior knows the heart but not the pressure of another frame: that is where the
 left cavity has the volume given. The right pressure follows that of any frame that was seen. What
-the surfaces miss has the sds that were inferred; volumes have that of their data.
+the surfaces miss has the sds that were inferred, and so has what a volume misses, the sum of errors
+that correlate over the surface.
 """
 
 from pathlib import Path
@@ -10,8 +11,9 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.distance import cdist
 from studies.common.output import Case
-from studies.human_heart.heart import SURFACES, surfaces_of
+from studies.human_heart.heart import LENGTH, SURFACES, surfaces_of
 
 import calibrate as cal
 from calibrate.measurements.collection import observations
@@ -19,7 +21,9 @@ from calibrate.measurements.frames import along_normals, spread_evenly
 from calibrate.measurements.surface import SurfacePoints
 from calibrate.measurements.volume import CavityVolume
 from emulator.core.errors import InputError
-from emulator.geometry.facets import MM3_PER_ML
+from emulator.core.gaussian_process import CORRELATIONS
+from emulator.geometry.discretisation import facet_rule
+from emulator.geometry.facets import MM3_PER_ML, nodal_areas
 from emulator.scenes import Scene
 from emulator.surrogates.protocol import ForwardMap
 
@@ -28,7 +32,6 @@ VOLUMES = np.arange(140.0, 186.0, 3.0)  # mL, of the left cavity
 POINTS = 200  # of a surface
 _PRESSURES, _DRAWS, _SEED = 12, 240, 7
 _LEVELS = (0.05, 0.5, 0.95)
-_VOLUME_SD = 3.0  # mL, as of the data
 
 
 def bands_of(found: cal.Posterior, scene: Scene, forward: ForwardMap, quick: bool) -> Case:
@@ -46,7 +49,7 @@ def bands_of(found: cal.Posterior, scene: Scene, forward: ForwardMap, quick: boo
     observe = observations({**{f"surface:{n}": p for n, p in parts.items()},
                             **{f"volume:{n}": c for n, c in cavities.items()}})  # fmt: skip
     at = forward.at(observe.nodes)
-    seen = jax.jit(jax.vmap(lambda theta: observe(at(theta), theta)))
+    seen = jax.jit(jax.vmap(lambda theta: observe(at(theta)[None], theta[None])))
     draws = found.draws()
     rows = rng.choice(len(next(iter(draws.values()))), 24 if quick else _DRAWS)
     states = list(found.model.states.states)
@@ -61,6 +64,7 @@ def bands_of(found: cal.Posterior, scene: Scene, forward: ForwardMap, quick: boo
         values.append({name: np.asarray(value) for name, value in each.items()})
     by_name = {name: np.stack([v[name] for v in values]) for name in values[0]}
     left = by_name.pop(f"volume:{SURFACES[0]}")
+    areas = {n: _area(scene, n) for n in SURFACES}
     bands: Case = {"left_volume": VOLUMES.tolist(), "points": {}, "normals": {}}
     for name, part in parts.items():
         bands["points"][name] = part.points.round(4).tolist()
@@ -68,13 +72,20 @@ def bands_of(found: cal.Posterior, scene: Scene, forward: ForwardMap, quick: boo
     reached = [float(((left.min(axis=0) <= v) & (v <= left.max(axis=0))).mean()) for v in VOLUMES]
     bands["share_of_draws_that_reach_it"] = reached
     for name, value in by_name.items():
-        sd = _noise(draws, rows, name)
+        sd = _noise(draws, rows, name, parts, areas)
         at_volume = np.stack(
             [_at(v, left, value) + sd * rng.normal(size=value.shape[1:]) for v in VOLUMES]
         )
         quantiles = np.quantile(at_volume, _LEVELS, axis=1)
         bands[name] = quantiles.round(2).tolist()
     return bands
+
+
+def _area(scene: Scene, name: str) -> float:
+    """The area of a surface at rest, mm2."""
+    facets = scene.mesh.facet_set(name)
+    rule = facet_rule(scene.mesh.order, 4)
+    return float(nodal_areas(scene.mesh.nodes[facets], rule).sum())
 
 
 def _at(volume: float, left: np.ndarray, value: np.ndarray) -> np.ndarray:
@@ -87,12 +98,24 @@ def _at(volume: float, left: np.ndarray, value: np.ndarray) -> np.ndarray:
     return found
 
 
-def _noise(draws: dict[str, np.ndarray], rows: np.ndarray, name: str) -> np.ndarray:
+def _noise(
+    draws: dict[str, np.ndarray], rows: np.ndarray, name: str, parts: dict[str, SurfacePoints],
+    areas: dict[str, float],
+) -> np.ndarray:  # fmt: skip
     """The sd of a number of this observation by noise, by draw."""
-    if name.startswith("volume"):
-        return np.full(len(rows), _VOLUME_SD)
-    sds = [draws[f"{kind}_{name}"][rows] for kind in ("noise_sd", "spatial_sd")]
-    return np.hypot(*sds)[:, None]
+    kind, _, surface = name.partition(":")
+    if kind == "surface":
+        sds = [draws[f"{noise}_{name}"][rows] for noise in ("noise_sd", "spatial_sd")]
+        return np.hypot(*sds)[:, None]
+    points = parts[surface].points
+    correlation = CORRELATIONS["matern32"](cdist(points, points, "sqeuclidean") / LENGTH**2)
+    share = areas[surface] / len(points)  # of the surface, mm2
+    return (
+        draws[f"spatial_sd_surface:{surface}"][rows]
+        * share
+        * np.sqrt(correlation.sum())
+        / MM3_PER_ML
+    )
 
 
 def judged(bands: Case, data: Path, frames: tuple[str, ...]) -> Case:

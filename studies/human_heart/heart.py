@@ -10,6 +10,7 @@ from emulator.scenes import Scene
 
 SURFACES = ("lv_endocardium", "rv_endocardium", "epicardium")
 _FILES = ("LV_ENDOCARDIAL", "RV_ENDOCARDIAL", "EPICARDIAL")
+LENGTH = 25.0  # mm, over which what a fitted surface misses correlates
 IMAGED = "f018"
 FRAMES = ("f016", "f020", "f022", "f024")
 _SIZE = 8.256  # mm, edges of the mesh, of which the thinnest wall decides
