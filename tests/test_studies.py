@@ -34,6 +34,7 @@ QUICK = {
     "fem_posterior": "--quick",
     "fem_speed": "--quick",
     "few_runs": "--parts left_ventricle --mesh 4 8 1 --runs 1 5 --tests 3 --order 1",
+    "human_heart": "--data MEASURED/human_heart --quick",
     "human_myocardium": "--data MEASURED/myocardium_tables --quick",
     "imaged_heart": "--quick",
     "inverse_benchmark": "--quick",
@@ -100,8 +101,8 @@ FULL_ONLY = {
 }
 
 
-PEERS = {"pymecht": "pymecht"}
-"""Packages of others that a study compares with, which a developer need not have."""
+PEERS = {"human_heart": "gmsh", "pymecht": "pymecht"}
+"""Packages that a study compares with or meshes by, which a developer need not have."""
 
 
 def _given(word: str, given: dict[str, str]) -> str:

@@ -148,7 +148,7 @@ def main() -> None:
         model, given = model_of(scene, forward, data, frames, quick)
         found = posterior_of(*model.given(given), quick)
         case = told_by(found, scene)
-        case["bands"] = bands_of(found, scene, forward, quick)
+        case["bands"] = bands_of(found, scene, forward, data, frames, quick)
         case["judged"] = judged(case["bands"], data, judge)
         case["seconds"] = perf_counter() - began
         return case
