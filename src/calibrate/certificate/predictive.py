@@ -55,7 +55,7 @@ from calibrate.statistical_model import Data, Model
 from calibrate.statistical_model.errors import noise_sds
 from emulator.core.gaussian_process import squared_exponential
 
-_LENGTHS = (0.25, 0.5, 1.0, 2.0, 4.0)  # correlation lengths that are compared, in prior sd
+_LENGTHS = (0.25, 0.5, 1.0, 2.0, 4.0)  # correlation lengths that are compared, in sd of the points
 _NUGGETS = (1e-6, 1e-4, 1e-2, 1.0, 1e2)
 _TREND = 1e2
 _NEGLIGIBLE = 1e-3  # leave-one-out error, in noise sd, that changes no posterior
@@ -145,7 +145,7 @@ def fit_correction(
     for used in parts:
         fitted, loss = _fitted(x[used], errors[used], scales, rows, likely[used], kernels)
         if loss < smallest:
-            best, smallest = fitted._replace(local=used is likely), loss
+            best, smallest = fitted._replace(local=used is not every), loss
     return best
 
 

@@ -231,11 +231,10 @@ def noise_sds(model: Model, draws: Mapping[str, np.ndarray]) -> dict[str, float]
 
     draws : draws (s,) by the unknown's name; an inferred sd is the median of its draws.
     """
+    sites = model.noise_sites
     return {
-        name: float(noise.size({s: jnp.median(draws[site]) for s, site in sites.items()}))
-        for (name, noise), sites in zip(
-            model.noise.items(), model.noise_sites.values(), strict=True
-        )
+        name: float(noise.size({s: jnp.median(draws[site]) for s, site in sites[name].items()}))
+        for name, noise in model.noise.items()
     }
 
 

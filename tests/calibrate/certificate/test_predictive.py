@@ -29,6 +29,7 @@ def test_a_linear_error_is_learned_everywhere():
     far = 3.0 * points(50, 1)
     np.testing.assert_allclose(at(correction, far), linear(far), rtol=1e-3, atol=1e-3)
     assert correction.at.shape == (30, 2)  # padded
+    assert not correction.local
 
 
 def test_a_smooth_error_is_learned_between_its_points():
