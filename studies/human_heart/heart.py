@@ -94,7 +94,7 @@ def surfaces_of(folder: Path, frame: str) -> dict[str, Surface]:
     for name, file in zip(SURFACES, _FILES, strict=True):
         path = folder / f"{file}_{frame[1:]}.obj"
         if not path.is_file():
-            raise InputError(f"{path} does not exist; --data names the folder of the surfaces")
+            raise InputError(f"{path} does not exist; name the folder of the surfaces")
         found[name] = read_surface(path, name)
     return found
 
