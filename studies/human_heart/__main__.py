@@ -107,7 +107,6 @@ def told_by(found: cal.Posterior, scene: Scene) -> Case:
 
 def emulated(scene: Scene, folder: Path, quick: bool) -> tuple[em.Emulator, Case]:
     """The emulator of unloading and loading, and its error; one that is in ``folder`` is kept."""
-    began = perf_counter()
     if not (folder / "emulator.json").is_file():
         plan = replace(recipe("mechanics"), simulations=12 if quick else RUNS, order=1, seed=SEED)
         emulator = train(scene, plan, folder, progress=True)
@@ -115,7 +114,6 @@ def emulated(scene: Scene, folder: Path, quick: bool) -> tuple[em.Emulator, Case
     emulator = em.load(folder, scene)
     return emulator, {
         "nodes": len(scene.mesh.nodes),
-        "seconds": perf_counter() - began,
         "record": emulator.record.get("discrepancy"),
     }
 

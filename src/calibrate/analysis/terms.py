@@ -58,7 +58,7 @@ class HeldOut:
 
     @property
     def missed(self) -> bool:
-        """Whether too few points are inside the band: the other tests do not predict this one."""
+        """Whether so few points are inside the band that the others do not predict the test."""
         chance = bdtr(round(self.inside * self.points), self.points, 1.0 - 2.0 * _TAIL)
         return self.inside < _MISSED and bool(chance < _CHANCE)
 

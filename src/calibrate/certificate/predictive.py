@@ -132,7 +132,7 @@ def fit_correction(
     every = np.ones(len(x), dtype=bool)
     likely = every if likely is None or not likely.any() else likely
     parts, kernels = [every], list(product(_LENGTHS, _NUGGETS))
-    # Where data say much, points far away miss by so much more that they hide what is near.
+    # Precise data: the map misses far away by so much that errors near the posterior are hidden.
     if x.shape[1] + 2 <= likely.sum() < len(x):
         parts.append(likely)
     if like is not None and like.nugget > 0.0:

@@ -75,9 +75,9 @@ class LoadedEquilibrium:
     def solve(self, theta: jax.Array, start: jax.Array | None) -> Solution:
         """Return the equilibrium at ``theta`` (p,), its displacement (n, 3) in mm from the mesh.
 
-        It is sought from ``start`` (n, 3) mm, also from the mesh, or from the mesh itself, which is
-        the equilibrium of the image's loads.
-        Where that is not found, the status is why, and the displacement zero.
+        It is sought from ``start`` (n, 3) mm, a displacement from the mesh, too; by default from
+        the mesh itself, which is the equilibrium of the image's loads. Where it is not found, the
+        status says why, and the displacement is zero.
         """
         unloaded = self.unloaded(theta)
         w = unloaded.displacement
