@@ -23,7 +23,8 @@ from calibrate.posterior.diagnosis import diagnose, misfits, nothing_learned, su
 from calibrate.provenance import as_attributes, versions
 from calibrate.samplers import check_options, density_of, find_sampler, named_draws
 from calibrate.samplers.checkpoint import Checkpoint, identity_of
-from calibrate.samplers.laplace import MISSED_BY, find_modes, missed_mode
+from calibrate.samplers.density import prior_draws
+from calibrate.samplers.laplace import MISSED_BY, STARTS, find_modes, missed_mode
 from calibrate.samplers.protocol import Context
 from calibrate.state_names import split
 from calibrate.statistical_model import Data, Model
@@ -249,7 +250,7 @@ def sample(
     if MISSED_BY not in attributes:
         z = np.asarray(run.z).reshape(-1, density.dimension)
         key = jax.random.fold_in(jax.random.key(seed), _MODES)
-        modes = find_modes(density, checked, key, draws=z)
+        modes = find_modes(density, checked, prior_draws(density, key, STARTS), z)
         attributes |= missed_mode(density, checked, z, modes)
     rng_key = jax.random.fold_in(jax.random.key(seed), _PREDICTIONS) if predictions else None
     draws = named_draws(model, run.z)

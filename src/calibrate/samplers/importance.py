@@ -10,7 +10,9 @@ proportional to :math:`w_i^\beta`, and fresh points are drawn from this next pro
 The power :math:`\beta` is the largest at which a given number of points counts. With an eighth of
 the points the density of a step is at most some eight times that of the one before, so that several
 modes stay in, and ten steps contract it by :math:`10^9`. Points of earlier steps are let go: the
-time of a step is the same at every contraction. At :math:`\beta = 1` the proposal is fitted, twice
+time of a step is the same at every contraction. A population that is not there after three steps
+has some of its points climb the density by its gradient, and half of the next kernels are put beside
+the modes they reach: near a sharp ridge tempering alone takes dozens of steps. At :math:`\beta = 1` the proposal is fitted, twice
 or more, and fresh points of the last one, drawn after it was chosen, are weighted until they are
 worth twice the draws asked for: :math:`n = (\sum w_i)^2 / \sum w_i^2`. The
 :math:`m` draws are resampled from these points with probability proportional to :math:`w_i`; equal
@@ -32,6 +34,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
+from threading import Lock
 from typing import Any, ClassVar
 
 import numpy as np
@@ -46,6 +49,7 @@ from calibrate.samplers.diagnostics import (
     normalised,
     pareto_shape,
 )
+from calibrate.samplers.laplace import draws_beside, find_modes
 from calibrate.samplers.nuts import NUTS, NUTSOptions
 from calibrate.samplers.proposals import (
     Kernels,
@@ -68,6 +72,9 @@ _FEWEST = 512  # points of a step
 _PRIOR = 2.0  # draws of the prior, for one point of a step
 _FOUND = 200.0  # effective points from which a proposal is fitted
 _MOST_STEPS = 25
+# Steps after which a population looks for modes by the gradient, and points that climb to them.
+_PATIENCE, _CLIMBERS = 3, 8
+_ONE_CLIMBS = Lock()  # at a time, so that the gradient is compiled once
 _FITS, _MOST_FITS = 2, 6
 _LIGHT = 0.5  # Pareto shape of the weights of a good fit: their variance is finite
 _CHOSEN = 1024  # points that the kernels of a step are put around
@@ -153,9 +160,11 @@ class _Run:
 
     def search(self) -> None:
         """Move from the prior to the posterior, and fit a proposal there."""
-        for _ in range(_MOST_STEPS):  # one step at least: proposals are better than the prior
-            weights = tempered(self.points.log_weights, self._tempered)
-            self._go_to(self.points.z, weights, _CHOSEN, _NARROW, self._step)
+        for step in range(_MOST_STEPS):  # one step at least: proposals are better than the prior
+            z, weights = self.points.z, tempered(self.points.log_weights, self._tempered)
+            if step == _PATIENCE and weights.any():
+                z, weights = self._and_modes(z, weights)
+            self._go_to(z, weights, _CHOSEN, _NARROW, self._step)
             if (worth := effective_number(self.points.log_weights)) >= _FOUND:
                 break
         else:
@@ -167,6 +176,18 @@ class _Run:
             self.fit(self.points.z, self.points.log_weights)
             if fits >= _FITS and pareto_shape(self.points.log_weights) < _LIGHT:
                 break
+
+    def _and_modes(self, z: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return points z (s, p) and weights, half of them for draws beside the modes uphill."""
+        chosen = z[resampled(weights, _CHOSEN, self._rng)]
+        with _ONE_CLIMBS:
+            modes = find_modes(self._density, self._data, chosen[:_CLIMBERS], chosen)
+            count = _CHOSEN // _CLIMBERS
+            beside = draws_beside(self._density, self._data, modes, count, self._rng)
+        if not len(beside):
+            return z, weights
+        shares = np.full(len(beside), 1.0 / len(beside))
+        return np.concatenate([z, beside]), 0.5 * np.concatenate([weights, shares])
 
     def fit(self, z: np.ndarray, log_weights: np.ndarray) -> None:
         """Go to fresh points from kernels around weighted points z (s, p)."""

@@ -48,7 +48,7 @@ from emulator.core.minimise import minimise
 # missed; and the coordinates of the missed mode in words, if there is one.
 MISSED_BY, MISSED_AT = "missed_mode_nats", "missed_mode"
 
-_STARTS = 8  # draws of the prior from which modes are searched
+STARTS = 8  # draws of the prior from which modes are searched
 _MOST = 500  # iterations of the optimiser
 _STEP = 1e-4  # step of central differences of the gradient; coordinates are about 1 wide
 _AWAY = 0.05  # largest distance from the mode, in sd, at which the optimiser may stop
@@ -71,7 +71,7 @@ class LaplaceOptions(Options):
 
     draws: int = 1000
     chains: int = 4
-    starts: int = _STARTS
+    starts: int = STARTS
 
     label: ClassVar[str] = "Laplace"
 
@@ -115,7 +115,7 @@ class Laplace(Sampler):
         template = _Gaussian(number, number, Modes(number, number))
         gaussian = context.checkpoint.restore(lambda: template)
         if gaussian is None:
-            modes = find_modes(density, data, start_key, options.starts)
+            modes = find_modes(density, data, prior_draws(density, start_key, options.starts))
             if not len(modes.z):
                 raise SolverError(
                     "the posterior density is zero wherever the optimiser could start"
@@ -154,9 +154,8 @@ def _draw(
     """Return draws (s, p), log densities and the Gaussian's, (s,), of twice as many trials."""
     count, size = options.chains * options.draws, len(gaussian.mode)
     noise = np.asarray(jax.random.normal(key, (2 * count, size)))
-    # H = L L^T, so L^-T times white noise has covariance H^-1.
     factor = np.linalg.cholesky(gaussian.precision)
-    z = gaussian.mode + solve_triangular(factor, noise.T, lower=True, trans="T").T
+    z = gaussian.mode + _coloured(noise, factor)
     lp = np.asarray(_compile(density).heights(jnp.asarray(z), data))
     rows = np.flatnonzero(np.isfinite(lp))[:count]
     if len(rows) < count:
@@ -166,6 +165,11 @@ def _draw(
         )
     log_q = -0.5 * (noise**2).sum(axis=1) + np.log(np.diag(factor)).sum()
     return z[rows], lp[rows], log_q[rows] - 0.5 * size * np.log(2.0 * np.pi)
+
+
+def _coloured(noise: np.ndarray, factor: np.ndarray) -> np.ndarray:
+    """Return white ``noise`` (s, p) with the covariance H^-1, where H = L L^T, L = ``factor``."""
+    return solve_triangular(factor, noise.T, lower=True, trans="T").T
 
 
 class _Programs(NamedTuple):
@@ -195,13 +199,9 @@ class Modes(NamedTuple):
 
 
 def find_modes(
-    density: Density,
-    data: Data,
-    key: jax.Array,
-    starts: int = _STARTS,
-    draws: np.ndarray | None = None,
+    density: Density, data: Data, starts: np.ndarray, draws: np.ndarray | None = None
 ) -> Modes:
-    """Return where L-BFGS ends from ``starts`` draws of the prior; none where the density is zero.
+    """Return where L-BFGS ends from points ``starts`` (m, p); none where the density is zero.
 
     draws : draws (s, p) of the posterior, if there are any; in coordinates in which they are white
         the optimiser takes a few steps, where a sharp posterior takes thousands.
@@ -219,11 +219,24 @@ def find_modes(
 
     minima = [
         minimise(negative, np.linalg.solve(factor, start), iterations=_MOST, tolerance=1e-12)
-        for start in prior_draws(density, key, starts)
+        for start in starts
     ]
     minima = sorted((m for m in minima if np.isfinite(m.value)), key=lambda m: m.value)
     z = np.array([factor @ m.x for m in minima]).reshape(len(minima), density.dimension)
     return Modes(z, np.array([-m.value for m in minima]))
+
+
+def draws_beside(
+    density: Density, data: Data, modes: Modes, count: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Return ``count`` draws z (s, p) of the Gaussian at each mode; none where it has no width."""
+    draws = [np.zeros((0, density.dimension))]
+    for mode in modes.z:
+        precision, smallest, _ = _curvature(density, data, mode)
+        if smallest > 0.0:
+            noise = rng.normal(size=(count, len(mode)))
+            draws.append(mode + _coloured(noise, np.linalg.cholesky(precision)))
+    return np.concatenate(draws)
 
 
 def missed_mode(density: Density, data: Data, z: np.ndarray, modes: Modes) -> dict[str, Any]:

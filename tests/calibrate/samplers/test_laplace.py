@@ -15,6 +15,7 @@ from numpyro.distributions import Normal
 import calibrate as cal
 from calibrate.posterior.diagnosis import diagnose
 from calibrate.samplers import Density, LaplaceOptions
+from calibrate.samplers.density import prior_draws
 from calibrate.samplers.laplace import MISSED_AT, MISSED_BY, find_modes, missed_mode
 from emulator.core.errors import SolverError
 from linear_support import LinearForward, linear_forward, linear_problem
@@ -129,7 +130,7 @@ def density(log_density, size, spread=3.0):
 
 def missed(log_density, draws):
     of = density(log_density, draws.shape[1])
-    return missed_mode(of, {}, draws, find_modes(of, {}, KEY, draws=draws))
+    return missed_mode(of, {}, draws, find_modes(of, {}, prior_draws(of, KEY, 8), draws))
 
 
 def two(weight, apart=4.0, width=0.5):
