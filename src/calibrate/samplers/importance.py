@@ -11,15 +11,15 @@ The power :math:`\beta` is the largest at which a given number of points counts.
 the points the density of a step is at most some eight times that of the one before, so that several
 modes stay in, and ten steps contract it by :math:`10^9`. Points of earlier steps are let go: the
 time of a step is the same at every contraction. A population that is not there after three steps
-has some of its points climb the density by its gradient, and half of the next kernels are put beside
-the modes they reach: near a sharp ridge tempering alone takes dozens of steps. At :math:`\beta = 1` the proposal is fitted, twice
-or more, and fresh points of the last one, drawn after it was chosen, are weighted until they are
-worth twice the draws asked for: :math:`n = (\sum w_i)^2 / \sum w_i^2`. The
-:math:`m` draws are resampled from these points with probability proportional to :math:`w_i`; equal
-ones occur. The variance of a mean of draws is that of the points and that of the choice among them,
-at most :math:`\sigma^2 / n + \sigma^2 / m`: the draws are worth two thirds of :math:`m` or more.
-Every weight is of the model's own density, so nothing is approximated but by the number of points.
-The mean of the weights is the evidence.
+has some of its points climb the density by its gradient, and half of the next kernels are put
+beside the modes they reach: near a sharp ridge tempering alone takes dozens of steps. At
+:math:`\beta = 1` the proposal is fitted, twice or more, and fresh points of the last one, drawn
+after it was chosen, are weighted until they are worth twice the draws asked for: :math:`n = (\sum
+w_i)^2 / \sum w_i^2`. The :math:`m` draws are resampled from these points with probability
+proportional to :math:`w_i`; equal ones occur. The variance of a mean of draws is that of the points
+and that of the choice among them, at most :math:`\sigma^2 / n + \sigma^2 / m`: the draws are worth
+two thirds of :math:`m` or more. Every weight is of the model's own density, so nothing is
+approximated but by the number of points. The mean of the weights is the evidence.
 
 Independent populations take the place of chains: their R-hat shows whether they found the same
 posterior. Where they did not, because a mode is hard to find, or where a tail is heavy, each is
