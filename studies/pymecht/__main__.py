@@ -83,7 +83,8 @@ def peer() -> ModuleType:
     try:
         import pymecht
     except ImportError as error:
-        raise InputError(f"compares with pymecht: pip install pymecht ({error})") from None
+        install = "pip install pymecht 'pyDOE<0.9'"
+        raise InputError(f"compares with pymecht: {install} ({error})") from None
     return pymecht
 
 

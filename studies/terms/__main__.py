@@ -1,6 +1,6 @@
 """Twenty twins of two to four terms out of twelve: are the true ones found?
 
-    python -m studies.terms                     # five minutes
+    python -m studies.terms                     # four minutes
     python -m studies.terms --quick --out DIR
 
 Each twin has three biaxial tests and three shears with independent errors of 2 % of the stresses'
