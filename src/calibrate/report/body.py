@@ -28,6 +28,8 @@ _WIDTH = 1.3  # of the picture, in its heights
 def body_figure(posterior: Posterior, simulator: Simulator | None) -> go.Figure:
     """Return the deformed surface with a slider over draws and a menu of colours.
 
+    Of several load states the last is shown; a button plays the mean shapes of all.
+
     simulator : FEM, which the map is compared with at the mean theta; None for no comparison.
     """
     model = posterior.model
@@ -56,17 +58,23 @@ def body_figure(posterior: Posterior, simulator: Simulator | None) -> go.Figure:
     )  # fmt: skip
     figure.add_mesh3d(
         **_xyz(scene.mesh.nodes[nodes]), i=i, j=j, k=k, color="grey", opacity=0.12,
-        name="at rest", showlegend=True, hoverinfo="skip",
+        name="as imaged" if scene.loaded_by else "at rest", showlegend=True, hoverinfo="skip",
     )  # fmt: skip
     if scene.fibres is not None:
         figure.add_trace(_fibres(scene, mean, of_elements["deformed_fibres"]))
     frames = {"mean": mean} | {f"draw {n}": u for n, u in enumerate(shown, start=1)}
+    states = {
+        name: np.asarray(predict(posterior.thetas(name)[rows[:: -(-len(rows) // _DRAWS)]])).mean(0)
+        for name in model.states.states
+        if len(model.states.states) > 1
+    }
+    frames |= states
     at_rest = scene.mesh.nodes[nodes]
     figure.frames = [
         go.Frame(name=name, traces=[0], data=[go.Mesh3d(**_xyz(at_rest + u[nodes]))])
         for name, u in frames.items()
     ]
-    _add_controls(figure, list(frames), {n: v[nodes] for n, v in colours.items()})
+    _add_controls(figure, list(frames), {n: v[nodes] for n, v in colours.items()}, list(states))
     shapes = np.concatenate([at_rest, *(at_rest + u[nodes] for u in frames.values())])
     return figure.update_layout(scene_camera=_camera(np.ptp(shapes, axis=0)))
 
@@ -137,8 +145,10 @@ def _fibres(scene: Scene, mean: np.ndarray, directions: np.ndarray) -> go.Scatte
     )  # fmt: skip
 
 
-def _add_controls(figure: go.Figure, names: list[str], colours: dict[str, np.ndarray]) -> None:
-    """Add a slider over the shapes and a menu of the colours."""
+def _add_controls(
+    figure: go.Figure, names: list[str], colours: dict[str, np.ndarray], played: list[str]
+) -> None:
+    """Add a slider over the shapes, a menu of the colours, and a button that plays shapes."""
     at_once = {"mode": "immediate", "frame": {"duration": 0, "redraw": True},
                "transition": {"duration": 0}}  # fmt: skip
     steps = [{"label": n, "method": "animate", "args": [[n], at_once]} for n in names]
@@ -147,9 +157,14 @@ def _add_controls(figure: go.Figure, names: list[str], colours: dict[str, np.nda
         style = _coloured(values, title)
         restyle = {"intensity": [style["intensity"]], "colorbar.title.text": [title]}
         buttons.append({"label": title, "method": "restyle", "args": [restyle, [0]]})
+    menus: list[dict[str, Any]] = [{"buttons": buttons, "x": 0.0, "xanchor": "left", "y": 1.12}]
+    if played:
+        pace = {"frame": {"duration": 700, "redraw": True}, "transition": {"duration": 0}}
+        play = {"label": "play states", "method": "animate", "args": [played, pace]}
+        menus += [{"type": "buttons", "buttons": [play], "x": 0.5, "xanchor": "left", "y": 1.12}]
     figure.update_layout(
         sliders=[{"steps": steps, "currentvalue": {"prefix": "shape: "}, "pad": {"t": 10}}],
-        updatemenus=[{"buttons": buttons, "x": 0.0, "xanchor": "left", "y": 1.12}],
+        updatemenus=menus,
         scene={"aspectmode": "data", **{f"{a}axis": {"title": f"{a} (mm)"} for a in "xyz"}},
         height=680,
         legend={"x": 0.0, "y": 0.0},

@@ -73,8 +73,8 @@ def html_of(
     body: list[tuple[str, list[Markup]]] = []
     if not is_specimen(scene):
         of_body = parts.note(
-            "Drag to turn. The slider goes through draws of the posterior; the menu changes the "
-            "colour; fibres and the body at rest are in the legend."
+            "Drag to turn. The slider goes through draws of the posterior, and the mean shape of "
+            "each load state; the menu changes the colour; fibres and the mesh are in the legend."
         )
         body = [("The body", [of_body, parts.chart(body_figure(posterior, simulator))])]
     sections = [
