@@ -21,7 +21,17 @@ import jax
 from studies.common.output import Case, Results, parser, run
 from studies.human_heart.bands import KEPT_APART, bands_of, judged
 from studies.human_heart.figures import draw
-from studies.human_heart.heart import FRAMES, LENGTH, SURFACES, scene_of, surfaces_of
+from studies.human_heart.heart import (
+    AS_IMAGED,
+    CONTRACTING,
+    FRAMES,
+    LENGTH,
+    OTHERS,
+    SYSTOLE,
+    Assumed,
+    scene_of,
+    surfaces_of,
+)
 from studies.human_heart.twins import coverage, twin, unloaded_volumes
 
 import calibrate as cal
@@ -36,30 +46,44 @@ from emulator.training import recipe, train
 HERE = Path(__file__).parent
 SEED = 18
 POINTS, RUNS, TWINS = 60, 44, 20  # of a surface, as data; FEM runs of the emulator; hearts
+FEWER = 30  # FEM runs of the emulator of contraction
+CERTIFIED = 48  # FEM runs of the certificate, of four load states each
 # Pressures by frame, mmHg: mean and sd of the left one; the right one is a fifth to a quarter.
 PRESSURES = {"f016": (5.0, 2.0), "f020": (5.0, 2.0), "f022": (6.0, 2.5), "f024": (8.0, 4.0)}
+PRESSURES[SYSTOLE] = (120.0, 15.0)
 AT_REST = (5.0, 2.0)  # in the frame that is meshed
+_MATERIAL = ("a", "a_f", "imaged", "imaged_right", "pericardium", "annulus")
 
 
-def prior_of(scene: Scene, frames: tuple[str, ...]) -> dict[str, Any]:
-    """Pressures as physiology has them; the rest by the scene's ranges."""
+def prior_of(scene: Scene, frames: tuple[str, ...], told: Case | None = None) -> dict[str, Any]:
+    """Pressures as physiology has them; the rest by the scene's ranges, or as ``told`` has it.
+
+    told : means and sds of parameters that other frames told.
+    """
     ranges = {p.name: (p.low, p.high) for p in scene.parameters}
 
     def about(name: str, mean: float, sd: float) -> Any:
         return cal.truncated_normal(mean * KPA_PER_MMHG, sd * KPA_PER_MMHG, *ranges[name])
 
-    prior = {"imaged": about("imaged", *AT_REST)}
-    prior["imaged_right"] = about("imaged_right", *(0.225 * x for x in AT_REST))
+    priors = {"imaged": ("imaged", 1.0, AT_REST), "imaged_right": ("imaged_right", 0.225, AT_REST)}
     for frame in frames:
-        mean, sd = PRESSURES[frame]
-        prior[f"pressure@{frame}"] = about("pressure", mean, sd)
-        prior[f"right_pressure@{frame}"] = about("right_pressure", 0.225 * mean, 0.225 * sd)
+        priors[f"pressure@{frame}"] = ("pressure", 1.0, PRESSURES[frame])
+        priors[f"right_pressure@{frame}"] = ("right_pressure", 0.225, PRESSURES[frame])
+    prior = {
+        unknown: about(name, share * mean, share * sd)
+        for unknown, (name, share, (mean, sd)) in priors.items()
+        if name in ranges
+    }
+    for name, row in (told or {}).items():
+        if name in ranges:
+            prior[name] = cal.truncated_normal(row["mean"], row["sd"], *ranges[name])
     return prior
 
 
 def model_of(
-    scene: Scene, forward: Any, folder: Path, frames: tuple[str, ...], quick: bool
-) -> tuple[cal.Model, Any]:
+    scene: Scene, forward: Any, folder: Path, frames: tuple[str, ...], quick: bool,
+    assumed: Assumed = AS_IMAGED, told: Case | None = None,
+) -> tuple[cal.Model, Any]:  # fmt: skip
     """The model of these frames' surfaces, and their data.
 
     Volumes are of the same surfaces, and would count them twice.
@@ -67,9 +91,9 @@ def model_of(
     observe, data = frame_data(
         scene,
         {
-            f"{name}@{frame}": surface
+            f"{facets}@{frame}": surfaces_of(folder, frame)[surface]
             for frame in frames
-            for name, surface in surfaces_of(folder, frame).items()
+            for facets, surface in assumed.surfaces.items()
         },
         12 if quick else POINTS,
     )
@@ -78,9 +102,9 @@ def model_of(
     )
     noise = {
         f"surface:{name}": cal.CorrelatedNoise(LENGTH, sd_scale=0.5, spatial_sd_scale=1.5)
-        for name in SURFACES
+        for name in assumed.surfaces
     }
-    model = cal.model(forward, observe, noise, prior_of(scene, frames))
+    model = cal.model(forward, observe, noise, prior_of(scene, frames, told))
     return model, {name: data[name] for name in observe.parts}
 
 
@@ -91,24 +115,23 @@ def posterior_of(model: cal.Model, data: Any, quick: bool) -> cal.Posterior:
     return cal.sample(model, data, sampler="nuts", options=options, seed=SEED, predictions=False)
 
 
-def told_by(found: cal.Posterior, scene: Scene) -> Case:
+def told_by(found: cal.Posterior, scene: Scene, assumed: Assumed = AS_IMAGED) -> Case:
     """Means, sds and 90 % intervals of all unknowns, and the quality of the draws."""
-    volumes = {
-        name: {"mean": float(v.mean()), "sd": float(v.std())}
-        for name, v in unloaded_volumes(found, scene).items()
-    }
+    volumes = {} if assumed.contracts else unloaded_volumes(found, scene, assumed.cavities)
     return {
         "posterior": found.summary(),
-        "unloaded_ml": volumes,
+        "unloaded_ml": {
+            name: {"mean": float(v.mean()), "sd": float(v.std())} for name, v in volumes.items()
+        },
         "divergences": found.divergences,
         "box": [str(end) for end in found.box_ends()],
     }
 
 
-def emulated(scene: Scene, folder: Path, quick: bool) -> tuple[em.Emulator, Case]:
+def emulated(scene: Scene, folder: Path, quick: bool, runs: int = RUNS) -> tuple[em.Emulator, Case]:
     """The emulator of unloading and loading, and its error; one that is in ``folder`` is kept."""
     if not (folder / "emulator.json").is_file():
-        plan = replace(recipe("mechanics"), simulations=12 if quick else RUNS, order=1, seed=SEED)
+        plan = replace(recipe("mechanics"), simulations=12 if quick else runs, order=1, seed=SEED)
         emulator = train(scene, plan, folder, progress=True)
         em.save_emulator(emulator, folder)
     emulator = em.load(folder, scene)
@@ -116,6 +139,23 @@ def emulated(scene: Scene, folder: Path, quick: bool) -> tuple[em.Emulator, Case
         "nodes": len(scene.mesh.nodes),
         "record": emulator.record.get("discrepancy"),
     }
+
+
+def under(assumed: Assumed, data: Path, folder: Path, passive: Case) -> Case:
+    """The posterior under other assumptions, or of the end of systole.
+
+    passive : means and sds of what the frames between the waves told, for the end of systole.
+    """
+    folder /= assumed.name.replace(" ", "_")
+    scene = scene_of(data, folder, assumed)
+    runs = FEWER if assumed.contracts else RUNS
+    emulator, trained = emulated(scene, folder / "emulator", quick=False, runs=runs)
+    frames, told = ((SYSTOLE,), passive) if assumed.contracts else (FRAMES, None)
+    began = perf_counter()
+    model, given = model_of(scene, emulator.cache(), data, frames, False, assumed, told)
+    found = posterior_of(*model.given(given), quick=False)
+    case = {**told_by(found, scene, assumed), "emulator": trained}
+    return {**case, "seconds": perf_counter() - began}
 
 
 def main() -> None:
@@ -151,13 +191,28 @@ def main() -> None:
         case["seconds"] = perf_counter() - began
         return case
 
+    def against_fem() -> Case:
+        began = perf_counter()
+        model, given = model_of(scene, forward, data, FRAMES, quick)
+        found = posterior_of(*model.given(given), quick)
+        certificate = cal.certify(
+            found, em.Simulator(scene), draws=CERTIFIED, mesh=0, seed=SEED, progress=True
+        )
+        return {**certificate.to_json(), "seconds": perf_counter() - began}
+
     frames = FRAMES[2:] if quick else FRAMES
-    results.case("all frames", lambda: of_frames(frames, frames))
+    whole = results.case("all frames", lambda: of_frames(frames, frames))
     for frame in () if quick else FRAMES:
         others = tuple(other for other in FRAMES if other != frame)
         case = results.case(f"without {frame}", lambda o=others, f=frame: of_frames(o, (f,)))
         case.pop("bands", None)
         jax.clear_caches()
+    if not quick:
+        results.case("certificate", against_fem)
+        passive = {n: r for n, r in whole["posterior"].items() if n in _MATERIAL}
+        for assumed in (*OTHERS, CONTRACTING):
+            results.case(assumed.name, lambda a=assumed: under(a, data, keep.parent, passive))
+            jax.clear_caches()
     model, _ = model_of(scene, forward, data, FRAMES, quick)
     twins = [
         results.case(

@@ -18,12 +18,15 @@ _SD, _SPATIAL_SD = 0.3, 1.2  # mm, of what a fitted surface misses
 AT_REST = {"pressure": 0.0, "right_pressure": 0.0}
 
 
-def unloaded_volumes(found: cal.Posterior, scene: Scene) -> dict[str, np.ndarray]:
+def unloaded_volumes(
+    found: cal.Posterior, scene: Scene, cavities: tuple[str, ...] = SURFACES[:2]
+) -> dict[str, np.ndarray]:
     """Draws of the volume in mL of each cavity without pressure."""
     state = next(iter(found.model.states.states))
+    at_rest = {name: 0.0 for name in AT_REST if name in scene.parameter_names}
     return {
-        f"unloaded {name}": found.predict(AT_REST, CavityVolume(scene, name), state=state)
-        for name in SURFACES[:2]
+        f"unloaded {name}": found.predict(at_rest, CavityVolume(scene, name), state=state)
+        for name in cavities
     }
 
 

@@ -99,6 +99,14 @@ class Homogeneous:
 
     def evaluate(self, theta: jax.Array) -> Prediction:
         """Return the displacement (k, 3) mm, and whether all states are in equilibrium."""
+        return self._program(theta)
+
+    @cached_property
+    def _program(self) -> Callable[[jax.Array], Prediction]:
+        """The map, traced once however often it is called or differentiated."""
+        return jax.jit(self._evaluate)
+
+    def _evaluate(self, theta: jax.Array) -> Prediction:
         elements, rows, corners = self._places
         point = Point(point_energy(self.scene, theta), stress_and_moduli(self.scene, theta))
         tissue = jax.tree.map(lambda each: each[elements, 0], self.scene.tissue_at(theta))
