@@ -11,6 +11,7 @@ kept apart, given the left cavity's volume alone, and human_heart.png. Meshing n
 from __future__ import annotations
 
 import json
+import tomllib
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,9 +19,10 @@ from time import perf_counter
 from typing import Any
 
 import jax
+import numpy as np
 from studies.common.output import Case, Results, parser, run
 from studies.human_heart.bands import KEPT_APART, bands_of, judged
-from studies.human_heart.figures import draw
+from studies.human_heart.figures import draw, draw_surface
 from studies.human_heart.heart import (
     AS_IMAGED,
     CONTRACTING,
@@ -47,6 +49,7 @@ HERE = Path(__file__).parent
 SEED = 18
 POINTS, RUNS, TWINS = 60, 44, 20  # of a surface, as data; FEM runs of the emulator; hearts
 FEWER = 30  # FEM runs of the emulator of contraction
+MOMENTS = 100  # draws of which a mean and an sd are shown
 CERTIFIED = 48  # FEM runs of the certificate, of four load states each
 # Pressures by frame, mmHg: mean and sd of the left one; the right one is a fifth to a quarter.
 PRESSURES = {"f016": (5.0, 2.0), "f020": (5.0, 2.0), "f022": (6.0, 2.5), "f024": (8.0, 4.0)}
@@ -128,6 +131,21 @@ def told_by(found: cal.Posterior, scene: Scene, assumed: Assumed = AS_IMAGED) ->
     }
 
 
+def on_surface(found: cal.Posterior, scene: Scene, frame: str) -> Case:
+    """Mean and sd of the surface's displacement from the imaged frame, at the nodes, mm."""
+    thetas = found.thetas(frame)[:: -(-len(found.thetas(frame)) // MOMENTS)]
+    nodes = np.unique(scene.mesh.surface[:, :3])
+    at = found.model.full.at(nodes)
+    u = np.asarray(jax.jit(lambda t: jax.lax.map(at, t))(thetas))
+    return {
+        "frame": frame,
+        "nodes": nodes.tolist(),
+        "moved": u.mean(axis=0).round(2).tolist(),
+        "mean": np.linalg.norm(u, axis=2).mean(axis=0).round(2).tolist(),
+        "sd": np.sqrt(u.var(axis=0).sum(axis=1)).round(3).tolist(),
+    }
+
+
 def emulated(scene: Scene, folder: Path, quick: bool, runs: int = RUNS) -> tuple[em.Emulator, Case]:
     """The emulator of unloading and loading, and its error; one that is in ``folder`` is kept."""
     if not (folder / "emulator.json").is_file():
@@ -188,6 +206,7 @@ def main() -> None:
         case = told_by(found, scene)
         case["bands"] = bands_of(found, scene, forward, data, frames, quick)
         case["judged"] = judged(case["bands"], data, judge)
+        case["surface"] = on_surface(found, scene, frames[-1])
         case["seconds"] = perf_counter() - began
         return case
 
@@ -205,7 +224,8 @@ def main() -> None:
     for frame in () if quick else FRAMES:
         others = tuple(other for other in FRAMES if other != frame)
         case = results.case(f"without {frame}", lambda o=others, f=frame: of_frames(o, (f,)))
-        case.pop("bands", None)
+        for part in ("bands", "surface"):
+            case.pop(part, None)
         jax.clear_caches()
     if not quick:
         results.case("certificate", against_fem)
@@ -222,6 +242,8 @@ def main() -> None:
     ]
     results.write(coverage=coverage(twins))
     draw({case["name"]: case for case in results.cases}, arguments.out / "human_heart.png")
+    axis = np.array(tomllib.loads((keep.parent / "heart.toml").read_text())["fibres"]["axis"])
+    draw_surface(whole["surface"], scene, axis, arguments.out / "surface.png")
 
 
 if __name__ == "__main__":

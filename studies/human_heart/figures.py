@@ -3,10 +3,12 @@
 from pathlib import Path
 
 import numpy as np
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from studies.common.output import Case, save
 from studies.human_heart.heart import SURFACES
 
 from calibrate.figures import BLUE, ORANGE, pyplot
+from emulator.scenes import Scene
 
 
 def draw(cases: dict[str, Case], path: Path) -> None:
@@ -47,4 +49,36 @@ def draw(cases: dict[str, Case], path: Path) -> None:
     axes[2].set_xlabel("posterior sd, % of the mean")
     for axis in axes:
         axis.spines[["top", "right"]].set_visible(False)
+    save(figure, path)
+
+
+def draw_surface(case: Case, scene: Scene, axis: np.ndarray, path: Path) -> None:
+    """The fullest frame's shape, by the mean and the sd of how far its nodes have moved.
+
+    axis : the long axis (3,), from apex to base.
+    """
+    figure = pyplot().figure(figsize=(9.0, 4.6), layout="constrained")
+    corners, mean = scene.mesh.surface[:, :3], np.array(case["mean"])
+    points = scene.mesh.nodes.copy()
+    points[np.array(case["nodes"])] += np.array(case["moved"])
+    # Turned so that the axis is upright.
+    upright = np.linalg.qr(np.column_stack([axis, np.eye(3)[:, :2]]))[0]
+    upright *= np.sign(upright[:, :1].T @ axis)
+    turned = (points - points.mean(axis=0)) @ np.roll(upright, -1, axis=1)
+    values = {"mean": mean, "sd": np.array(case["sd"])}
+    for k, (name, told) in enumerate(values.items(), start=1):
+        at_nodes = np.zeros(len(points))
+        at_nodes[np.array(case["nodes"])] = told
+        each = at_nodes[corners].mean(axis=1)
+        axes = figure.add_subplot(1, 2, k, projection="3d")
+        scale = pyplot().Normalize(each.min(), each.max())
+        faces = Poly3DCollection(turned[corners], facecolors=pyplot().cm.viridis(scale(each)))
+        axes.add_collection3d(faces)
+        low, high = turned.min(axis=0), turned.max(axis=0)
+        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+        axes.set_box_aspect(high - low, zoom=1.4)
+        axes.set_axis_off()
+        axes.view_init(elev=15.0, azim=-60.0)
+        colours = pyplot().cm.ScalarMappable(scale, "viridis")
+        figure.colorbar(colours, ax=axes, shrink=0.7, label=f"{name} of displacement, mm")
     save(figure, path)
