@@ -52,7 +52,7 @@ STARTS = 8  # draws of the prior from which modes are searched
 _MOST = 500  # iterations of the optimiser
 _STEP = 1e-4  # step of central differences of the gradient; coordinates are about 1 wide
 _AWAY = 0.05  # largest distance from the mode, in sd, at which the optimiser may stop
-_AWAY_OF_MASS = 0.3  # the same limit where only the mass at a mode is computed
+_AWAY_OF_MASS = 0.3  # the same limit where only a mode's mass is computed, or draws are beside it
 _LIGHTER = 3.0  # nats by which a missed mode may be lighter than the draws: a twentieth
 _BESIDE = 0.5  # distance to the nearest draw, in sd, below which a mode is not missed
 _VALLEY = 2.0  # nats by which a valley is lower than both its ends
@@ -229,11 +229,11 @@ def find_modes(
 def draws_beside(
     density: Density, data: Data, modes: Modes, count: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """Return ``count`` draws z (s, p) of the Gaussian at each mode; none where it has no width."""
+    """Return ``count`` draws z (s, p) of the Gaussian at each mode; none where there is none."""
     draws = [np.zeros((0, density.dimension))]
     for mode in modes.z:
-        precision, smallest, _ = _curvature(density, data, mode)
-        if smallest > 0.0:
+        precision, smallest, distance = _curvature(density, data, mode)
+        if smallest > 0.0 and distance < _AWAY_OF_MASS:
             noise = rng.normal(size=(count, len(mode)))
             draws.append(mode + _coloured(noise, np.linalg.cholesky(precision)))
     return np.concatenate(draws)

@@ -103,7 +103,7 @@ class Homogeneous:
 
     @cached_property
     def _program(self) -> Callable[[jax.Array], Prediction]:
-        """The map, traced once however often it is called or differentiated."""
+        """The map, compiled once also where it is called by hand: its loops would be each time."""
         return jax.jit(self._evaluate)
 
     def _evaluate(self, theta: jax.Array) -> Prediction:
