@@ -61,10 +61,11 @@ def draw_surface(case: Case, scene: Scene, axis: np.ndarray, path: Path) -> None
     corners, mean = scene.mesh.surface[:, :3], np.array(case["mean"])
     points = scene.mesh.nodes.copy()
     points[np.array(case["nodes"])] += np.array(case["moved"])
-    # Turned so that the axis is upright.
-    upright = np.linalg.qr(np.column_stack([axis, np.eye(3)[:, :2]]))[0]
-    upright *= np.sign(upright[:, :1].T @ axis)
-    turned = (points - points.mean(axis=0)) @ np.roll(upright, -1, axis=1)
+    # Turned, and not mirrored, so that the axis is upright.
+    upright = axis / np.linalg.norm(axis)
+    across = np.cross(upright, [1.0, 0.0, 0.0])
+    across /= np.linalg.norm(across)
+    turned = points @ np.column_stack([across, np.cross(upright, across), upright])
     values = {"mean": mean, "sd": np.array(case["sd"])}
     for k, (name, told) in enumerate(values.items(), start=1):
         at_nodes = np.zeros(len(points))

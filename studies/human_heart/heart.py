@@ -55,13 +55,12 @@ OTHERS = (
 )
 CONTRACTING = Assumed("contraction", contracts=True)
 
-_LOADS = ("pressure", "right_pressure")
 _IMAGED = {"pressure": "imaged", "right_pressure": "imaged_right"}
 
 
 def _scene_file(assumed: Assumed, axis: list[float]) -> str:
     """The scene's file, of the mesh heart.vtu beside it."""
-    loads = _LOADS[: len(assumed.cavities)]
+    loads = tuple(_IMAGED)[: len(assumed.cavities)]
     lines = ['law = "holzapfel_ogden"', 'mesh = "heart.vtu"']
     if assumed.loaded:
         image = {name: _IMAGED[name] for name in loads}

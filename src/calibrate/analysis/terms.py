@@ -58,7 +58,7 @@ class HeldOut:
 
     @property
     def missed(self) -> bool:
-        """Whether so few points are inside the band that the others do not predict the test."""
+        """The others do not predict the test: too few of its points are inside the band."""
         chance = bdtr(round(self.inside * self.points), self.points, 1.0 - 2.0 * _TAIL)
         return self.inside < _MISSED and bool(chance < _CHANCE)
 

@@ -28,7 +28,7 @@ _WIDTH = 1.3  # of the picture, in its heights
 def body_figure(posterior: Posterior, simulator: Simulator | None) -> go.Figure:
     """Return the deformed surface with a slider over draws and a menu of colours.
 
-    Of several load states the last is shown; a button plays the mean shapes of all.
+    With several load states, the last is shown, and a button plays the mean shapes of all.
 
     simulator : FEM, which the map is compared with at the mean theta; None for no comparison.
     """
@@ -63,11 +63,8 @@ def body_figure(posterior: Posterior, simulator: Simulator | None) -> go.Figure:
     if scene.fibres is not None:
         figure.add_trace(_fibres(scene, mean, of_elements["deformed_fibres"]))
     frames = {"mean": mean} | {f"draw {n}": u for n, u in enumerate(shown, start=1)}
-    states = {
-        name: np.asarray(predict(posterior.thetas(name)[rows[:: -(-len(rows) // _DRAWS)]])).mean(0)
-        for name in model.states.states
-        if len(model.states.states) > 1
-    }
+    several = model.states.states if len(model.states.states) > 1 else ()
+    states = {name: np.asarray(predict(posterior.thetas(name)[rows])).mean(0) for name in several}
     frames |= states
     at_rest = scene.mesh.nodes[nodes]
     figure.frames = [

@@ -182,9 +182,9 @@ def test_two_load_states_have_an_ejection_fraction(ventricle_posterior):
     assert charts.state_volumes(ventricle_posterior) == {}
     figure = body_figure(posterior, None)
     assert figure.layout.updatemenus[1].buttons[0].args[0] == ("full", "empty")
-    heights = {frame.name: np.ptp(np.asarray(frame.data[0].x)) for frame in figure.frames}
-    assert heights["full"] > heights["empty"]  # inflated, it is wider
-    assert heights["empty"] == pytest.approx(heights["mean"], rel=1e-3)
+    widths = {frame.name: np.ptp(np.asarray(frame.data[0].x)) for frame in figure.frames}
+    assert widths["full"] > widths["empty"]  # inflated
+    assert widths["empty"] == pytest.approx(widths["mean"], rel=1e-3)
 
 
 def test_in_a_browser(page, tmp_path):

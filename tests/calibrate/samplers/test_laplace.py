@@ -16,7 +16,14 @@ import calibrate as cal
 from calibrate.posterior.diagnosis import diagnose
 from calibrate.samplers import Density, LaplaceOptions
 from calibrate.samplers.density import prior_draws
-from calibrate.samplers.laplace import MISSED_AT, MISSED_BY, find_modes, missed_mode
+from calibrate.samplers.laplace import (
+    MISSED_AT,
+    MISSED_BY,
+    Modes,
+    draws_beside,
+    find_modes,
+    missed_mode,
+)
 from emulator.core.errors import SolverError
 from linear_support import LinearForward, linear_forward, linear_problem
 
@@ -131,6 +138,20 @@ def density(log_density, size, spread=3.0):
 def missed(log_density, draws):
     of = density(log_density, draws.shape[1])
     return missed_mode(of, {}, draws, find_modes(of, {}, prior_draws(of, KEY, 8), draws))
+
+
+def test_draws_beside_modes_have_their_gaussians():
+    """Correlated, against the closed form; of a slope that has no mode there are none."""
+    covariance = np.array([[0.04, 0.03], [0.03, 0.09]])
+    precision = jnp.asarray(np.linalg.inv(covariance))
+    of = density(lambda z: -0.5 * (z - 1.0) @ precision @ (z - 1.0), 2)
+    rng, modes = np.random.default_rng(0), Modes(np.ones((1, 2)), np.zeros(1))
+    draws = draws_beside(of, {}, modes, 4000, rng)
+    np.testing.assert_allclose(draws.mean(axis=0), 1.0, atol=0.02)
+    np.testing.assert_allclose(np.cov(draws, rowvar=False), covariance, atol=0.005)
+    beside = Modes(np.zeros((1, 2)), np.zeros(1))  # some sd down the slope
+    assert draws_beside(of, {}, beside, 10, rng).shape == (0, 2)
+    assert draws_beside(density(jnp.sum, 2), {}, modes, 10, rng).shape == (0, 2)
 
 
 def two(weight, apart=4.0, width=0.5):

@@ -91,14 +91,20 @@ def test_an_incompressible_specimen_keeps_its_volume(tissue):
     np.testing.assert_allclose(Homogeneous(stiff, forward.nodes)(THETA), u, atol=1e-4)
 
 
-def test_many_theta_and_some_nodes(tissue, compressible):
+def test_many_theta_and_some_nodes(tissue, compressible, monkeypatch):
     thetas = jnp.stack([THETA, 1.5 * THETA, 0.3 * THETA])
     batch = jax.jit(jax.vmap(compressible.evaluate))(thetas)
     assert batch.valid.all()
     for theta, u in zip(thetas, batch.displacement, strict=True):
         np.testing.assert_allclose(compressible(theta), u, atol=1e-12)
     nodes = np.array([50, 3, 17])
-    np.testing.assert_allclose(compressible.at(nodes)(THETA), batch.displacement[0, nodes])
+    traced, evaluate = [], Homogeneous._evaluate
+    counted = lambda self, theta: traced.append(theta) or evaluate(self, theta)
+    monkeypatch.setattr(Homogeneous, "_evaluate", counted)
+    few = compressible.at(nodes)
+    for theta, u in zip(thetas, batch.displacement, strict=True):
+        np.testing.assert_allclose(few(theta), u[nodes], atol=1e-12)
+    assert len(traced) == 1  # by hand, too, it is compiled once
 
 
 @pytest.mark.parametrize("incompressible", [False, True])
