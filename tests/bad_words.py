@@ -22,7 +22,15 @@ COMMANDS = [
         "frames left_ventricle --surface endocardium@a=none.stl --out frames.csv",
         "none.stl does not exist",
     ),
-    ("frames left_ventricle --out frames.csv", "are required: --surface"),
+    ("frames left_ventricle --out frames.csv", "give either --surface or --field"),
+    (
+        "frames left_ventricle --field none.csv --out frames.csv",
+        "--field: give one or two files, and --amount PARAMETER=FILE:COLUMN",
+    ),
+    (
+        "frames left_ventricle --field none.csv --amount pressure=p.csv --out frames.csv",
+        "--amount 'pressure=p.csv'; give PARAMETER=FILE:COLUMN",
+    ),
     ("simulate beam", "scene 'beam' is unknown"),
     ("simulate missing.toml", "missing.toml does not exist"),
     ("simulate once_clamped_beam --theta mu=500 lam=60", "parameter 'mu' is 500 kPa"),

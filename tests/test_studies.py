@@ -39,6 +39,7 @@ QUICK = {
     "imaged_heart": "--quick",
     "inverse_benchmark": "--quick",
     "large_meshes": "--quick",
+    "living_skin": "--data MEASURED/living_skin --quick",
     "many_solves": "--solves 3",
     "mesh_row": "--quick",
     "mesh_to_certificate": "--ventricles 1 --mesh 5 10 1",

@@ -27,6 +27,7 @@ from .measurements import (
     surface_distances,
     surface_points,
 )
+from .measurements.full_field import FullField, field_data, read_full_field
 from .model_error import placement, rigid_motion
 from .noise import CorrelatedNoise, DiscrepancyNoise, GaussianNoise, StudentTNoise
 from .population import Hierarchy, hierarchy, read_hierarchy
@@ -84,6 +85,7 @@ __all__ = [
     "Density",
     "Dependence",
     "DiscrepancyNoise",
+    "FullField",
     "GaussianNoise",
     "Hierarchy",
     "ImportanceOptions",
@@ -111,6 +113,7 @@ __all__ = [
     "certify",
     "compare",
     "density_of",
+    "field_data",
     "hierarchy",
     "identify",
     "in_words",
@@ -127,6 +130,7 @@ __all__ = [
     "placement",
     "population_of_fits",
     "read_experiment",
+    "read_full_field",
     "read_hierarchy",
     "read_posterior",
     "reweight",

@@ -15,6 +15,8 @@ from .geometry.fibres import wall_depth
 from .geometry.heart import mesh_heart
 from .geometry.io import Body, read_body, read_mesh, write_mesh, write_solution
 from .geometry.mesh import Mesh, boundary_facets
+from .geometry.random_field import matern_modes
+from .geometry.sheet import mesh_sheet, regions_within
 from .geometry.side_by_side import Bodies, side_by_side
 from .geometry.two_surfaces import mesh_wall
 from .mechanics import laws
@@ -76,14 +78,17 @@ __all__ = [
     "laws",
     "load",
     "loads",
+    "matern_modes",
     "mesh_error",
     "mesh_heart",
+    "mesh_sheet",
     "mesh_wall",
     "potential_energy",
     "read_body",
     "read_mesh",
     "read_runs",
     "recipe",
+    "regions_within",
     "released_network",
     "run_campaign",
     "save_emulator",

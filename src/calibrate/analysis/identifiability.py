@@ -53,7 +53,7 @@ from emulator.core.errors import InputError, look_up
 from emulator.core.minimise import minimise
 from emulator.fem.energy import point_energy
 from emulator.scenes.scene import Scene
-from emulator.scenes.tissue import Tissue
+from emulator.scenes.tissue import Tissue, stiffness_of
 
 _PRIOR_DRAWS = 4096
 # Exponents are rounded to be readable; those that round to zero are left out.
@@ -292,7 +292,7 @@ def stress_band(
     """Return the 90 % band of stresses under a stretch along ``fibre`` or ``cross-fibre``.
 
     A law without fibres has no directions; both are the same then. In a scene with regions it is
-    that of a stiffness factor of the first.
+    that of the first; modes of stiffness do not count.
 
     Raises
     ------
@@ -314,7 +314,7 @@ def stress_band(
 
 def stresses(scene: Scene, theta: jax.Array, axis: jax.Array, stretch: np.ndarray) -> jax.Array:
     """Return stress differences (n,), kPa, along ``axis`` (3,); fibres along x, sheets along y."""
-    energy, at = point_energy(scene, theta), _tissue(scene)
+    energy, at = point_energy(scene, theta), _tissue(scene, theta)
 
     def along(value: jax.Array) -> jax.Array:
         projection = jnp.outer(axis, axis)
@@ -325,11 +325,15 @@ def stresses(scene: Scene, theta: jax.Array, axis: jax.Array, stretch: np.ndarra
     return lam * jax.vmap(jax.grad(along))(lam)
 
 
-def _tissue(scene: Scene) -> Tissue:
-    """Return the tissue of one element with the fibre along x, and the sheet along y."""
+def _tissue(scene: Scene, theta: jax.Array) -> Tissue:
+    """Return the tissue of the first region, the fibre along x and the sheet along y."""
     directions = None
     if scene.law.sheets:
         directions = jnp.stack([_FIBRE, _CROSS])
     elif scene.law.fibres:
         directions = _FIBRE
-    return Tissue(directions, None if scene.regions is None else jnp.array(0))
+    if scene.regions is None:
+        return Tissue(directions)
+    factors = stiffness_of(scene.regions, None, scene.resolve(theta))
+    assert factors is not None
+    return Tissue(directions, factors[int(np.argmin(scene.regions))])

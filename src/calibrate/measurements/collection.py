@@ -7,11 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.sparse import csr_array, eye_array, vstack
 
 from calibrate.measurements.observation import Observation
 from calibrate.state_names import split, states_of
@@ -101,6 +102,57 @@ class Observations:
             data |= dict(zip(names, by_state, strict=True))
         return {name: data[name] for name in self.parts}
 
+    @cached_property
+    def decoding(self) -> Decoding:
+        """What a map that is linear in its coefficients has to decode, in place of all nodes."""
+        wholes, groups = dict[str, Observation](), dict[str, list[str]]()
+        for name, part in self.parts.items():
+            whole = part.restricted(None)
+            key = json.dumps(whole.to_json())
+            wholes.setdefault(key, whole)
+            groups.setdefault(key, []).append(name)
+        columns = np.arange(3 * len(self.nodes)).reshape(-1, 3)
+        blocks, rows, others = list[csr_array](), dict[str, np.ndarray](), dict[str, Observation]()
+        start = 0
+        for key, names in groups.items():
+            matrix = wholes[key].matrix
+            if matrix is None:
+                others |= {name: self.parts[name] for name in names}
+                continue
+            every = np.arange(matrix.shape[0])
+            own = {n: every if (e := self.parts[n].entries) is None else e for n in names}
+            used = np.unique(np.concatenate(list(own.values())))
+            block = csr_array(matrix)[used].tocoo()
+            places = block.row, columns[self._rows[names[0]]].ravel()[block.col]
+            blocks.append(csr_array((block.data, places), (len(used), columns.size)))
+            rows |= {n: start + np.searchsorted(used, entries) for n, entries in own.items()}
+            start += len(used)
+        rest = Observations(others) if others else None
+        if rest is not None:
+            place = {int(node): k for k, node in enumerate(self.nodes)}
+            seen = columns[[place[int(node)] for node in rest.nodes]].ravel()
+            blocks.append(csr_array(eye_array(columns.size, format="csr")[seen]))
+        return Decoding(csr_array(vstack(blocks)), rows, rest)
+
+    def decoded(self, values: jax.Array, thetas: jax.Array) -> dict[str, jax.Array]:
+        """Return the data of each part without noise from what :attr:`decoding` asks for.
+
+        values : the product (S, r) of its matrix and the displacements in every load state.
+        thetas : theta in every load state, (S, p).
+        """
+        _, rows, rest = self.decoding
+        data: dict[str, jax.Array] = {}
+        for name, own in rows.items():
+            state, first = self.states.index(split(name)[1]), int(own[0])
+            in_a_row = np.array_equal(own, np.arange(first, first + len(own)))
+            taken = values[state, first : first + len(own)] if in_a_row else values[state, own]
+            data[name] = taken.reshape(self.parts[name].shape)
+        if rest is not None:
+            states = np.array([self.states.index(state) for state in rest.states])
+            u = values[states, values.shape[1] - 3 * len(rest.nodes) :]
+            data |= rest(u.reshape(len(states), -1, 3), thetas[states])
+        return {name: data[name] for name in self.parts}
+
     def gripped(self, shares: np.ndarray) -> Observations:
         """Return the same observations of a gripped specimen, see :meth:`Observation.gripped`."""
         return replace(self, parts={n: part.gripped(shares) for n, part in self.parts.items()})
@@ -141,6 +193,20 @@ class Observations:
     def to_json(self) -> dict[str, Any]:
         """Return the description of each part, by name."""
         return {name: part.to_json() for name, part in self.parts.items()}
+
+
+class Decoding(NamedTuple):
+    """What observations need of the displacements of their nodes.
+
+    matrix : its product (r,) with the displacements (3 k,) has the data of linear observations, and
+        after it the displacements of the nodes of the others.
+    rows : the rows of each linear observation's data, by its name.
+    others : the other observations; None where all are linear.
+    """
+
+    matrix: csr_array
+    rows: Mapping[str, np.ndarray]
+    others: Observations | None
 
 
 def observations(observe: Observation | Mapping[str, Observation] | Observations) -> Observations:

@@ -30,8 +30,9 @@ import numpy as np
 
 from calibrate.measurements import OBSERVATIONS
 from calibrate.measurements.collection import Observations, check_some, observations
-from calibrate.measurements.observation import Block, Observation, Table
+from calibrate.measurements.observation import Block, Field, Observation, Table
 from calibrate.measurements.tables import (
+    KNOWN,
     DataTable,
     read_csv,
     read_netcdf,
@@ -147,8 +148,11 @@ def write_data(
     path: str | Path,
     observe: Observation | Observations,
     values: np.ndarray | Mapping[str, np.ndarray],
+    known: Mapping[str, float] = {},
 ) -> None:
     """Write data by name: netCDF where ``path`` ends in ``.nc``, CSV otherwise.
+
+    known : values of parameters that are known exactly, by ``parameter@state``.
 
     :class:`InputError` for an observation under a name that its kind cannot have in a file.
     """
@@ -163,5 +167,8 @@ def write_data(
                 f"there it would be called {' or '.join(part.names)}"
             )
         states[state].append(part.block(base, part.filled(np.asarray(data[name]))))
+    for name, value in known.items():
+        base, state = split(name)
+        states[state].append([(Field(KNOWN + base, (KNOWN + base,)), np.asarray(value))])
     write = write_netcdf if Path(path).suffix.lower() == ".nc" else write_csv
     write(path, states)

@@ -17,6 +17,7 @@ from typing import Any, Self
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.sparse import csr_array, eye_array, kron
 
 from calibrate.measurements.location import locate
 from calibrate.measurements.observation import LENGTH_UNITS, Field, Scalar
@@ -65,6 +66,11 @@ class NodalDisplacements(DisplacementPoints):
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the displacements themselves."""
         return displacement
+
+    @property
+    def matrix(self) -> csr_array:
+        """The identity."""
+        return eye_array(3 * len(self.nodes), format="csr")
 
     @classmethod
     def of(cls, scene: Scene, nodes: str | np.ndarray | list[int] = "all") -> Self:
@@ -129,6 +135,14 @@ class Landmarks(DisplacementPoints):
         """Return interpolated displacements (..., d, 3)."""
         values = displacement[..., self.members, :]
         return jnp.sum(values * self.weights[:, :, None], axis=-2)
+
+    @property
+    def matrix(self) -> csr_array:
+        """The shape functions at the points, for each component."""
+        rows = np.repeat(np.arange(len(self.members)), self.members.shape[1])
+        entries = (self.weights.ravel(), (rows, self.members.ravel()))
+        of_one = csr_array(entries, shape=(len(self.members), len(self.nodes)))
+        return csr_array(kron(of_one, np.eye(3)))
 
     @classmethod
     def of(cls, scene: Scene, points: Any) -> Self:

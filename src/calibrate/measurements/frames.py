@@ -19,6 +19,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from calibrate.measurements.collection import Observations, observations
+from calibrate.measurements.full_field import spread_points
 from calibrate.measurements.location import facet_shapes
 from calibrate.measurements.observation import Observation
 from calibrate.measurements.surface import SurfacePoints
@@ -99,12 +100,7 @@ def spread_evenly(mesh: Mesh, facet_set: str, count: int) -> np.ndarray:
             f"facet set '{facet_set}' has {len(places)} facets away from its rims; "
             + (f"ask for fewer points than {count}" if len(places) else "observe another")
         )
-    chosen = [0]
-    ways = np.linalg.norm(places - places[0], axis=1)
-    for _ in range(count - 1):
-        chosen.append(int(np.argmax(ways)))
-        ways = np.minimum(ways, np.linalg.norm(places - places[chosen[-1]], axis=1))
-    return places[chosen]
+    return places[spread_points(places, count)]
 
 
 def _outward(mesh: Mesh, facet_set: str) -> float:

@@ -21,6 +21,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 
 import jax
 import numpy as np
+from scipy.sparse import csr_array
 
 from calibrate.noise.gaussian import GaussianNoise
 from calibrate.noise.protocol import Sites
@@ -150,6 +151,14 @@ class Observation(ABC):
     def data_of_tests(self) -> Mapping[str, np.ndarray]:
         """The entries (k,) of the data of each of a specimen's tests, by its name."""
         return {}
+
+    @property
+    def matrix(self) -> csr_array | None:
+        """The matrix (e, 3 k) of data without gaps, (e,), by the displacement of the nodes, (3 k,).
+
+        None where the data is no linear function of the displacement, or depends on theta.
+        """
+        return None
 
     def labels(self, name: str) -> Labels:
         """Return the labels of the data called ``name`` in the DataTree."""

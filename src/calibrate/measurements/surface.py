@@ -38,6 +38,7 @@ from typing import Any, Self
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.sparse import csr_array
 
 from calibrate.measurements.location import closest_point, facet_shapes
 from calibrate.measurements.observation import LENGTH_UNITS, Field, Table
@@ -116,8 +117,20 @@ class SurfacePoints(OfFacetSet):
 
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
         """Return normal displacements (..., d)."""
-        along = self.weights[:, :, None] * self.normals[:, None]
+        along = self._along
         return jnp.einsum("dai,...dai->...d", along, displacement[..., self.members, :])
+
+    @property
+    def matrix(self) -> csr_array:
+        """The shape functions at the points, times the normals."""
+        columns = 3 * self.members[:, :, None] + np.arange(3)
+        rows = np.broadcast_to(np.arange(len(columns))[:, None, None], columns.shape)
+        entries = (self._along.ravel(), (rows.ravel(), columns.ravel()))
+        return csr_array(entries, shape=(len(columns), 3 * len(self.nodes)))
+
+    @property
+    def _along(self) -> np.ndarray:
+        return self.weights[:, :, None] * self.normals[:, None]
 
     @classmethod
     def of(cls, scene: Scene, facet_set: str, points: Any, slack: float = _SLACK) -> Self:

@@ -17,7 +17,13 @@ import numpy as np
 
 from calibrate.measurements import Observations
 from calibrate.measurements.points import DisplacementPoints
-from calibrate.model_error.systematic import Systematic, curve_modes, placement, rigid_motion
+from calibrate.model_error.systematic import (
+    Systematic,
+    curve_modes,
+    placement,
+    rigid_motion,
+    spatial_modes,
+)
 from calibrate.state_names import split
 from emulator.core import schema
 from emulator.core.errors import InputError, look_up
@@ -250,7 +256,75 @@ class Curve:
         )
 
 
-Kind = RigidMotion | Placement | Pins | Gain | Curve
+@dataclass(frozen=True)
+class Field:
+    r"""An error of displacements that is smooth in space and grows along the loading.
+
+    It is what image correlation and the model miss of a full field. Of a component at the point X,
+    in the state of amount a,
+
+    .. math:: e(X, a) = \sigma\, \frac{a}{a_\text{max}}\, f(X, a), \qquad
+              \operatorname{cov}(f, f') = k(|X - X'| / \ell)\, k(|a - a'| / \ell_a),
+
+    with Matérn's kernel k of smoothness 3/2.
+
+    of : the observations of displacements, of the same points, joined by ``+``.
+    along : the parameter that is known in each state and says how far the loading has come.
+    length : the correlation length in space, mm.
+    along_length : the correlation length along the loading, in the unit of ``along``; by default
+        the error is in proportion to the amount, one field for all states.
+    sd : the sd at the largest amount, mm; or
+    sd_scale : the scale of the half-normal prior of one that is inferred, as ``field_sd``.
+    share : the share of the error's variance that modes of few points may leave out.
+    """
+
+    of: str
+    along: str
+    length: float
+    along_length: float | None = None
+    sd: float | None = None
+    sd_scale: float | None = None
+    share: float = 0.01
+
+    def __post_init__(self) -> None:
+        if (self.sd is None) == (self.sd_scale is None):
+            raise InputError("give either sd (known) or sd_scale (of its prior)")
+        given = {"length": self.length, "sd": self.sd, "sd_scale": self.sd_scale}
+        for name, value in {**given, "along_length": self.along_length}.items():
+            if value is not None and not value > 0.0:
+                raise InputError(f"{name} is {value}; it must be above 0")
+        if not 0.0 <= self.share < 1.0:
+            raise InputError(f"share is {self.share}; it is a part of the variance, 0 to below 1")
+
+    def systematic(self, name: str, measured: Measured) -> Systematic:
+        """Return as many unknowns as carry all but a share of the variance."""
+        observations = measured.named(self.of)
+        points, components = measured.points(observations[0])[0], measured.shape(observations[0])[1]
+        for each in observations:
+            if not np.array_equal(measured.points(each)[0], points):
+                raise InputError(f"of: '{each}' and '{observations[0]}' are of other points")
+        amounts = np.array([measured.known(self.along, each) for each in observations])
+        if not np.abs(amounts).max() > 0.0:
+            raise InputError(f"along: '{self.along}' is 0 in every state")
+        along = np.ones((1, len(amounts)))
+        if self.along_length is not None:
+            along = curve_modes(amounts, self.along_length)
+        grown = along * amounts / np.abs(amounts).max()
+        products = np.einsum("rd,qs->rqsd", spatial_modes(points, self.length), grown)
+        products = products.reshape(-1, len(amounts), len(points))
+        variances = np.sum(products**2, axis=(1, 2))
+        order = np.argsort(-variances)
+        carried = np.cumsum(variances[order]) / variances.sum()
+        kept = products[order[: int(np.searchsorted(carried, 1.0 - self.share)) + 1]]
+        size = None if self.sd_scale is None else ("field_sd", self.sd_scale)
+        each_of = np.eye(components)
+        rows = np.einsum("rsd,ci->rcsdi", kept * (self.sd or 1.0), each_of)
+        rows = rows.reshape(-1, len(amounts), len(points), components)
+        names = tuple(f"{name} {k + 1}" for k in range(len(rows)))
+        return Systematic(names, {n: rows[:, k] for k, n in enumerate(observations)}, size)
+
+
+Kind = RigidMotion | Placement | Pins | Gain | Curve | Field
 
 SYSTEMATIC_ERRORS: dict[str, type[Kind]] = {
     "rigid_motion": RigidMotion,
@@ -258,6 +332,7 @@ SYSTEMATIC_ERRORS: dict[str, type[Kind]] = {
     "pins": Pins,
     "gain": Gain,
     "curve": Curve,
+    "field": Field,
 }
 """Kinds of systematic error by their word in a file."""
 

@@ -24,8 +24,11 @@ likelihood of the residual r = y - g changes by
 .. math:: W - R^T P^{-1} R
 
 is left. Where B = 0 and the size is common to all modes, the modes are chosen such that
-:math:`G = A W A^T` is diagonal, once: then L = I, :math:`P = I + \alpha^2 G`. These are the *fixed*
-modes. Those that vary with x come after them, beside the information that the fixed modes leave.
+:math:`G = A W A^T` is diagonal, once: then L = I, :math:`P = I + \alpha^2 G`, and a likelihood of d
+numbers costs one product with the modes. These are the *fixed* modes, whose size is known or
+learned, and after them the *sized* ones, whose size is inferred, beside the information that the
+fixed modes leave. Where a mode is a share of the prediction, all that are not fixed *vary*, and are
+eliminated anew for each x.
 
 Shares are of the prediction g and not of the data y: the noise of the data would be scaled in the
 modes, too, so that smaller predictions would err less, and a scale of n numbers with share s would
@@ -52,7 +55,7 @@ from emulator.surrogates.protocol import fingerprint_of
 Means = Mapping[str, jax.Array]
 """Data without noise by the observation's name."""
 
-_VARYING = "varying_"  # prefix of the arrays of modes that vary
+_SIZED, _VARYING = "sized_", "varying_"  # prefixes of the arrays of these modes
 # Recorded in saved errors, because in earlier versions shares were of the data.
 _SHARES = "of the prediction"
 
@@ -86,22 +89,31 @@ class Amplitude:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
+class SizedModes:
+    """Modes with one size that is inferred, chosen such that G is diagonal.
+
+    weights, strength, modes : as of a :class:`ModelError`, W being what its fixed modes leave.
+    """
+
+    weights: np.ndarray
+    strength: np.ndarray
+    modes: np.ndarray
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
 class VaryingModes:
-    """Modes that depend on the prediction, or whose size is inferred.
+    """Modes that depend on the prediction, and beside them those whose size is inferred.
 
     modes, shares : A and B, (r, d).
     sized : 1 for each mode whose size is inferred, 0 where it is 1, (r,).
     information : W beside these modes, (d, d), or its diagonal (d,) where it has no other entries.
-    name, scale : name of the inferred size in the posterior, and the scale of its half-normal
-        prior; empty and 0 where every size is 1.
     """
 
     modes: np.ndarray
     shares: np.ndarray
     sized: np.ndarray
     information: np.ndarray
-    name: str = jax.tree.static(default="")
-    scale: float = jax.tree.static(default=0.0)
 
     def at(self, size: jax.Array | float, means: jax.Array) -> jax.Array:
         """Return V (r, d) where the inferred size is ``size`` and the prediction ``means`` (d,)."""
@@ -123,21 +135,27 @@ class ModelError:
     strength : the diagonal of G, (r,).
     modes : A, the fixed modes at size 1, (r, d).
     amplitude : the size of the fixed modes; ``None`` for 1.
-    varying : the modes that vary; ``None`` where there are none.
+    sized : the modes whose size is inferred, and
+    varying : the modes that vary; ``None`` where there are none. There are never both.
     names : names of the s unknowns z of systematic errors with known modes.
     mixing : orthogonal matrix (r, s) that makes the fixed modes of those of the named unknowns,
         less the rows of modes that no datum could tell from nothing.
     of_mesh : whether the errors were learned on a finer mesh, so that they are the mesh's as well.
+    size_name, size_scale : name of the inferred size in the posterior, and the scale of its
+        half-normal prior; empty and 0 where none is inferred.
     """
 
     weights: np.ndarray
     strength: np.ndarray
     modes: np.ndarray
     amplitude: Amplitude | None = None
+    sized: SizedModes | None = None
     varying: VaryingModes | None = None
     mixing: np.ndarray | None = None
     names: tuple[str, ...] = jax.tree.static(default=())
     of_mesh: bool = jax.tree.static(default=False)
+    size_name: str = jax.tree.static(default="")
+    size_scale: float = jax.tree.static(default=0.0)
 
     @property
     def of_fem(self) -> bool:
@@ -147,10 +165,7 @@ class ModelError:
     @property
     def priors(self) -> dict[str, dist.Distribution]:
         """Prior of the size that is inferred, by its name in the posterior; empty if none is."""
-        varying = self.varying
-        if varying is None or not varying.name:
-            return {}
-        return {varying.name: dist.HalfNormal(varying.scale)}
+        return {self.size_name: dist.HalfNormal(self.size_scale)} if self.size_name else {}
 
     def size(self, unknowns: jax.Array) -> jax.Array:
         """Return the size of the fixed modes, (), at ``unknowns``."""
@@ -179,23 +194,21 @@ class ModelError:
     def draw(self, rng_key: jax.Array, unknowns: jax.Array, means: Means) -> dict[str, jax.Array]:
         """Return data without noise that might have come: ``means`` plus a draw of the errors."""
         flat, unravel = ravel_pytree(dict(means))
-        key, varying_key = rng_key, rng_key
-        if self.varying is not None:
-            key, varying_key = jax.random.split(rng_key)
+        key, second = rng_key, rng_key
+        V = self._not_fixed(self._inferred_size(unknowns), flat)
+        if V is not None:
+            key, second = jax.random.split(rng_key)
         z = jax.random.normal(key, self.strength.shape)
         perturbed = flat + self.size(unknowns) * (z @ self.modes)
-        if self.varying is not None:
-            V = self.varying.at(self._inferred_size(unknowns), flat)
-            perturbed += jax.random.normal(varying_key, (len(V),)) @ V
+        if V is not None:
+            perturbed += jax.random.normal(second, (len(V),)) @ V
         return unravel(perturbed)
 
     def largest(self, means: Means) -> np.ndarray:
         """Return V (r, d) beside data like ``means``, an inferred size at its 99.7 % quantile."""
-        if self.varying is None:
-            return self.modes
         flat, _ = ravel_pytree(dict(means))
-        V = self.varying.at(PLAUSIBLE * self.varying.scale, flat)
-        return np.vstack([self.modes, np.asarray(V)])
+        V = self._not_fixed(PLAUSIBLE * self.size_scale, flat)
+        return self.modes if V is None else np.vstack([self.modes, np.asarray(V)])
 
     def unknowns(self, residual: Means) -> tuple[np.ndarray, np.ndarray]:
         """Return mean (s,) and covariance (s, s) of the named z given ``residual``, at one draw.
@@ -205,9 +218,9 @@ class ModelError:
         InputError
             Some of the errors vary with the prediction or in size.
         """
-        if self.varying is not None:
-            of_size = f"the size '{self.varying.name}' is inferred"
-            reason = of_size if self.varying.name else "some are shares of what is predicted"
+        if self.sized is not None or self.varying is not None:
+            of_size = f"the size '{self.size_name}' is inferred"
+            reason = of_size if self.size_name else "some are shares of what is predicted"
             raise InputError(f"what is known of errors: {reason}")
         assert self.mixing is not None
         flat = np.asarray(ravel_pytree(dict(residual))[0])
@@ -222,6 +235,10 @@ class ModelError:
         """Return the pivots P (r,), and R ``columns`` (r, m) of columns (d, m)."""
         alpha = self.size(unknowns)
         pivots, rows = 1.0 + alpha**2 * self.strength, alpha * (self.weights @ columns)
+        if self.sized is not None:
+            size = self._inferred_size(unknowns)
+            pivots = jnp.concatenate([pivots, 1.0 + size**2 * self.sized.strength])
+            rows = jnp.concatenate([rows, size * (self.sized.weights @ columns)])
         if self.varying is None:
             return pivots, rows
         flat, _ = ravel_pytree(dict(means))
@@ -231,7 +248,13 @@ class ModelError:
         return jnp.concatenate([pivots, more[0]]), jnp.concatenate([rows, more[1]])
 
     def _inferred_size(self, unknowns: jax.Array) -> jax.Array | float:
-        return unknowns[-1] if self.priors else 1.0
+        return unknowns[-1] if self.size_name else 1.0
+
+    def _not_fixed(self, size: jax.Array | float, means: jax.Array) -> jax.Array | None:
+        """Return V (r, d) of all modes that are not fixed; None where there are none."""
+        if self.sized is not None:
+            return size * jnp.asarray(self.sized.modes)
+        return None if self.varying is None else self.varying.at(size, means)
 
     @property
     def fingerprint(self) -> str:
@@ -243,8 +266,11 @@ class ModelError:
         arrays = {n: getattr(self, n) for n in ("weights", "strength", "modes", "mixing")}
         if self.amplitude is not None:
             arrays |= vars(self.amplitude)
-        if self.varying is not None:
-            arrays |= {f"{_VARYING}{n}": v for n, v in vars(self.varying).items() if n != "name"}
+        for prefix, group in ((_SIZED, self.sized), (_VARYING, self.varying)):
+            if group is not None:
+                arrays |= {f"{prefix}{n}": v for n, v in vars(group).items()}
+        if self.size_name:
+            arrays["size_scale"] = np.array(self.size_scale)
         if self.of_mesh:
             arrays["of_mesh"] = True
         return {name: np.asarray(value) for name, value in arrays.items() if value is not None}
@@ -254,8 +280,7 @@ class ModelError:
         """The plain JSON that :meth:`restore` needs besides arrays; empty for learned errors."""
         if self.mixing is None:
             return {}
-        size = None if self.varying is None else self.varying.name
-        return {"names": self.names, "size": size, "shares": _SHARES}
+        return {"names": self.names, "size": self.size_name, "shares": _SHARES}
 
     @classmethod
     def restore(cls, arrays: Mapping[str, np.ndarray], words: Mapping[str, Any]) -> ModelError:
@@ -273,29 +298,40 @@ class ModelError:
                 "the posterior is older than systematic errors that are shares of predictions; "
                 "infer again"
             )
-        own: dict[str, Any] = {n: v for n, v in arrays.items() if not n.startswith(_VARYING)}
+        own: dict[str, Any] = {
+            n: v for n, v in arrays.items() if not n.startswith((_SIZED, _VARYING))
+        }
         of_mesh = own.pop("of_mesh", None) is not None
         size = {each.name: own.pop(each.name) for each in fields(Amplitude) if each.name in own}
         if size:
             own["amplitude"] = Amplitude(**{**size, "width": float(size["width"])})
+        if sized := {n.removeprefix(_SIZED): v for n, v in arrays.items() if n.startswith(_SIZED)}:
+            own["sized"] = SizedModes(**sized)
         if varying := {n.removeprefix(_VARYING): v for n, v in arrays.items() if _VARYING in n}:
-            scale = float(varying.pop("scale"))
-            own["varying"] = VaryingModes(**varying, name=words["size"] or "", scale=scale)
-        return cls(**own, names=tuple(words.get("names", ())), of_mesh=of_mesh)
+            own["varying"] = VaryingModes(**varying)
+        own |= {"size_scale": float(own.get("size_scale", 0.0)), "of_mesh": of_mesh}
+        names = tuple(words.get("names", ()))
+        return cls(**own, names=names, size_name=words.get("size") or "")
 
 
-def diagonal(modes: np.ndarray, information: np.ndarray) -> tuple[np.ndarray, ...]:
+def diagonal(
+    modes: np.ndarray, information: np.ndarray, fixed: ModelError | None = None
+) -> tuple[np.ndarray, ...]:
     """Return fixed modes of the same covariance with a diagonal G.
 
     modes : the modes as they are declared, (s, d).
-    information : W, (d, d).
+    information : W, (d, d), or its diagonal (d,).
+    fixed : modes that come before these; W is what they leave.
 
     Returns
     -------
     weights, strength, modes, mixing : the fields of :class:`ModelError`.
     """
-    strength, mixing = np.linalg.eigh(modes @ information @ modes.T)
+    weighted = modes * information if information.ndim == 1 else modes @ information
+    if fixed is not None:
+        between = (weighted @ fixed.modes.T) / (1.0 + fixed.strength)
+        weighted = weighted - between @ fixed.weights
+    strength, mixing = np.linalg.eigh(weighted @ modes.T)
     visible = strength > 1e-12 * max(float(strength.max(initial=0.0)), 1e-300)
     rows = mixing[:, visible].T
-    mixed = rows @ modes
-    return mixed @ information, strength[visible], mixed, rows
+    return rows @ weighted, strength[visible], rows @ modes, rows

@@ -30,8 +30,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.distance import cdist
 
-from calibrate.model_error.marginal import ModelError, VaryingModes, diagonal
+from calibrate.model_error.marginal import ModelError, SizedModes, VaryingModes, diagonal
 from emulator.core.errors import InputError
 from emulator.core.gaussian_process import matern32
 
@@ -84,7 +85,8 @@ def marginalised(
     """Return ``errors`` together, integrated out.
 
     shapes : shape of each observation's data, by name.
-    information : information of the noise about the data's means, (d, d).
+    information : information of the noise about the data's means, (d, d), or its diagonal (d,)
+        where it has no other entries.
     unknowns : names of the model's unknowns, which a size that is inferred may not have.
 
     :class:`InputError` where an error does not fit the observations, or two sizes are to be
@@ -99,8 +101,6 @@ def marginalised(
     varying = [error for error in errors if error.varies]
     if not varying:
         return fixed
-    left = np.asarray(fixed.information_left(jnp.asarray(information), jnp.zeros(0), {}))
-    on_diagonal = np.diagonal(left)
     sizes = list(dict.fromkeys(error.size for error in varying if error.size is not None))
     if len(sizes) > 1:
         raise InputError(
@@ -112,6 +112,13 @@ def marginalised(
         raise InputError(
             f"systematic errors: a size is called '{name}', as an unknown of the model"
         )
+    fixed = replace(fixed, size_name=name, size_scale=scale)
+    if not any(np.any(each) for error in varying for each in error.shares.values()):
+        found = diagonal(_rows(varying, shapes, "modes"), information, fixed)
+        return replace(fixed, sized=SizedModes(*found[:3]))
+    whole = np.diag(information) if information.ndim == 1 else information
+    left = np.asarray(replace(fixed, size_name="").information_left(jnp.asarray(whole), jnp.zeros(0), {}))
+    on_diagonal = np.diagonal(left)
     sized = [np.full(len(error.names), float(error.size is not None)) for error in varying]
     return replace(
         fixed,
@@ -120,8 +127,6 @@ def marginalised(
             shares=_rows(varying, shapes, "shares"),
             sized=np.concatenate(sized),
             information=on_diagonal if np.array_equal(left, np.diag(on_diagonal)) else left,
-            name=name,
-            scale=scale,
         ),
     )
 
@@ -205,7 +210,21 @@ def curve_correlation(amounts: jax.Array, length: Any, constant: float = 0.0) ->
 
 def curve_modes(amounts: np.ndarray, length: float, *, constant: float = 0.0) -> np.ndarray:
     """Return modes V (r, n) of :func:`curve_correlation`, :math:`C = V^T V`."""
-    C = np.asarray(curve_correlation(jnp.asarray(amounts), length, constant))
+    return _modes(np.asarray(curve_correlation(jnp.asarray(amounts), length, constant)))
+
+
+def spatial_modes(points: np.ndarray, length: float) -> np.ndarray:
+    """Return modes V (r, d) of Matérn's correlation of smoothness 3/2 at points (d, 3) mm.
+
+    length : the correlation length, mm.
+    """
+    return _modes(
+        np.asarray(matern32(jnp.asarray(cdist(points, points, "sqeuclidean")) / length**2))
+    )
+
+
+def _modes(C: np.ndarray) -> np.ndarray:
+    """Return V (r, n), the largest first, with ``C = V^T V`` to round-off."""
     variances, vectors = np.linalg.eigh(C)
     used = variances > _NEGLIGIBLE * max(float(variances.max()), 1e-300)
     return np.sqrt(variances[used])[::-1, None] * vectors.T[used][::-1]

@@ -150,6 +150,8 @@ class SpatialNoise(Noise):
     sites : the sites at which the data was measured; a model sets them.
     """
 
+    independent: ClassVar[bool] = False
+
     length: float
     sd: float | None
     sd_scale: float | None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from numbers import Real
 from types import MappingProxyType
@@ -91,11 +91,13 @@ class Noise(ABC):
 
     kind : its name in the registry and in JSON.
     gaussian : whether it is Gaussian where all its numbers are known.
+    independent : whether the numbers of the data err each by itself.
     usage : its options on the command line, for help and errors.
     """
 
     kind: ClassVar[str]
     gaussian: ClassVar[bool] = True
+    independent: ClassVar[bool] = True
     usage: ClassVar[str]
 
     def __post_init__(self) -> None:
@@ -161,6 +163,24 @@ def information_about_means(
 
     scales : the values of each noise's scales that are not known.
     """
+    flat, log_density = _about_means(noise, means, scales)
+    return -jax.hessian(log_density)(flat)
+
+
+def independent_information(
+    noise: Mapping[str, Noise], means: Mapping[str, jax.Array]
+) -> jax.Array:
+    """Return the diagonal (d,) of :func:`information_about_means`, of independent errors."""
+    flat, log_density = _about_means(noise, means, {})
+    return -jax.jvp(jax.grad(log_density), (flat,), (jnp.ones_like(flat),))[1]
+
+
+def _about_means(
+    noise: Mapping[str, Noise],
+    means: Mapping[str, jax.Array],
+    scales: Mapping[str, Mapping[str, jax.Array]],
+) -> tuple[jax.Array, Callable[[jax.Array], jax.Array]]:
+    """Return the means (d,) and the log density of data there as a function of means (d,)."""
     flat, unravel = ravel_pytree(means)
 
     def log_density(shifted: jax.Array) -> jax.Array:
@@ -168,7 +188,7 @@ def information_about_means(
         terms = [noise[n].distribution(at[n], scales.get(n, {})).log_prob(means[n]) for n in means]
         return sum(terms, jnp.zeros(()))
 
-    return -jax.hessian(log_density)(flat)
+    return flat, log_density
 
 
 def check_positive(what: str, value: object) -> None:

@@ -8,6 +8,9 @@ That program is one chain's, and as many chains run at once as there are cores. 
 transition of all chains would take as many gradients as the longest trajectory among them
 (docs/experiments.md, "NUTS chains one after the other", "Chains on threads").
 
+Of many unknowns a pilot run would tell too little. There the chains run in coordinates that are
+white at a mode (:func:`calibrate.samplers.laplace.white_at_mode`), where there is one.
+
 Chains start at random points, within two units of the centre.
 """
 
@@ -23,7 +26,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibrate.samplers.density import Target
+from calibrate.samplers.density import Density, Target, prior_draws
+from calibrate.samplers.laplace import white_at_mode
 from calibrate.samplers.protocol import ChainOptions, Context, Draws, Kernel, Sampler, in_rounds
 from calibrate.samplers.transport import (
     StandardMap,
@@ -38,6 +42,7 @@ from emulator.core.errors import SolverError
 _CHUNK = 50  # iterations between two updates of the progress bar
 _CANDIDATES = 16  # starting points tried, for forward maps that are not valid everywhere
 _PILOT, _FINAL = 0, 1  # runs
+_STARTS = 3  # draws of the prior from which a mode is searched
 _PILOT_DRAWS = 1000  # draws of all chains to which a map is fitted; large maps take more
 
 States = tuple[Any, ...]
@@ -192,11 +197,21 @@ class Chains:
         """Run the pilot, if the density wants one, and start the final run, or resume either."""
         pilot_key, key = jax.random.split(rng_key)
         if not self._resume():
+            if self.density.whitened:
+                self._whiten(pilot_key)
             self._start(*((_PILOT, pilot_key) if self.density.piloted else (_FINAL, key)))
         if self.run == _PILOT:
             z = self.draw(self._pilot).z
             self.map_ = fit_standard(z.reshape(-1, self.density.dimension))
             self._start(_FINAL, key)
+
+    def _whiten(self, key: jax.Array) -> None:
+        """Begin at a mode, in units of its curvature."""
+        assert isinstance(self.density, Density)
+        starts = prior_draws(self.density, key, _STARTS)
+        if (found := white_at_mode(self.density, self.data, starts)) is not None:
+            mode, root = map(jnp.asarray, found)
+            self.map_ = self.map_._replace(centre=mode, root=root)
 
     def draw(self, total: int) -> Draws:
         """Return the first ``total`` draws of this run, after its warm-up."""

@@ -8,7 +8,7 @@ is an argument, so that programs compiled for one data set serve others of its s
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -28,6 +28,7 @@ from emulator.surrogates.protocol import ForwardMap
 
 _BLOCK = 256  # points evaluated by one call of a program, so that it is compiled for one shape
 BATCH = 32  # points of a block that are vectorised
+_MOST_PILOTED = 20  # coordinates; more have more bends than a pilot run can tell
 _FARTHEST = 40.0  # |z| at which a bounded parameter is its bound in double precision
 
 
@@ -39,12 +40,14 @@ class Target:
     dimension : the number of coordinates, p.
     piloted : whether a pilot run straightens the density (:mod:`calibrate.samplers.transport`).
     at_once : the number of threads that may evaluate it at the same time.
+    whitened : whether chains run in coordinates that are white at a mode, in place of a pilot.
     """
 
     log_density: Callable[[jax.Array, Any], jax.Array]
     dimension: int
     piloted: bool
     at_once: int
+    whitened: bool = field(default=False, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -99,8 +102,9 @@ def density_of(model: Model) -> Density:
     return Density(
         log_density=log_density,
         dimension=len(names),
-        piloted=len(names) > 1,  # one coordinate has no other to depend on
+        piloted=1 < len(names) <= _MOST_PILOTED,  # one has no other to depend on
         at_once=threads_for(model.forward),
+        whitened=len(names) > _MOST_PILOTED,
         log_prior=log_prior,
         log_likelihood=log_likelihood,
         prior_draw=prior_draw,

@@ -191,6 +191,23 @@ def _compile(density: Density) -> _Programs:
     )
 
 
+def white_at_mode(
+    density: Density, data: Data, starts: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return a mode (p,) and R (p, p) with ``R R^T = H^-1``; None where there is no such mode.
+
+    starts : points (m, p) from which the optimiser starts.
+    """
+    modes = find_modes(density, data, starts)
+    if not len(modes.z):
+        return None
+    precision, smallest, distance = _curvature(density, data, modes.z[0])
+    if not (smallest > 0.0 and distance < _AWAY_OF_MASS):
+        return None
+    factor = np.linalg.cholesky(precision)
+    return modes.z[0], _coloured(np.eye(len(factor)), factor).T
+
+
 class Modes(NamedTuple):
     """Points ``z`` (m, p) where the optimiser ended, and log densities (m,), the highest first."""
 

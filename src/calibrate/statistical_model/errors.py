@@ -36,7 +36,7 @@ from jax.flatten_util import ravel_pytree
 from calibrate.model_error.kinds import Measured, read_systematic
 from calibrate.model_error.marginal import Amplitude, ModelError
 from calibrate.model_error.systematic import Systematic, marginalised
-from calibrate.noise import information_about_means
+from calibrate.noise.protocol import independent_information, information_about_means
 from calibrate.statistical_model.fem_likelihood import FEMLikelihood
 from calibrate.statistical_model.finer_fem import finer_fem
 from calibrate.statistical_model.model import Model
@@ -113,7 +113,7 @@ def errors_of_data(
 
 
 def _noise_information(model: Model, errors: str) -> np.ndarray:
-    """Return the information (d, d) of the noise about the data's means.
+    """Return the information (d, d) of the noise about the data's means, or its diagonal (d,).
 
     Marginalisation beside the noise needs one that is the same for all data and unknowns, so
     :class:`InputError` is raised where the noise is not Gaussian or of unknown sd.
@@ -122,7 +122,9 @@ def _noise_information(model: Model, errors: str) -> np.ndarray:
         if noise.priors or not noise.gaussian:
             raise InputError(f"{errors}: the noise of {name} must be Gaussian and of known sd")
     means = {name: jnp.zeros(shape) for name, shape in model.observe.shapes.items()}
-    return np.asarray(jax.jit(lambda m: information_about_means(model.noise, m))(means))
+    independent = all(noise.independent for noise in model.noise.values())
+    information = independent_information if independent else information_about_means
+    return np.asarray(jax.jit(lambda m: information(model.noise, m))(means))
 
 
 def _marginaliser(model: Model) -> Callable[[Sequence[Systematic]], ModelError]:

@@ -12,7 +12,7 @@ emulator with a correction, a reduced model or FEM.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -190,10 +190,9 @@ class Model:
         """
         draw = self.draw_unknowns()
         thetas = self.states.thetas(draw)
-        prediction = self.evaluate(thetas) if prediction is None else prediction
+        means, valid = self.means(thetas, prediction)
         # Where the forward map has no answer, the density is zero, not NaN.
-        numpyro.factor("valid", jnp.where(prediction.valid, 0.0, -jnp.inf))
-        means = self.observe(jnp.where(prediction.valid, prediction.displacement, 0.0), thetas)
+        numpyro.factor("valid", jnp.where(valid, 0.0, -jnp.inf))
         observed = None if data is None else self.observe.name(data, "data")
         if self.error is not None:
             if observed is None:
@@ -203,6 +202,27 @@ class Model:
         for name, distribution in self.distributions(draw, means).items():
             obs = None if observed is None else observed[name]
             numpyro.sample(f"observed_{name}", distribution, obs=obs)
+
+    def means(
+        self, thetas: jax.Array, prediction: Prediction | None = None
+    ) -> tuple[dict[str, jax.Array], jax.Array]:
+        """Return data without noise by observation, 0 where it is not valid, and its validity.
+
+        thetas : theta in every load state, (S, p).
+        prediction : the result of :meth:`evaluate` there, where it is known already.
+        """
+        if prediction is None and self._decoded is not None:
+            values, valid = jax.vmap(self._decoded)(thetas)
+            valid = jnp.all(valid)
+            return self.observe.decoded(jnp.where(valid, values, 0.0), thetas), valid
+        displacement, valid = self.evaluate(thetas) if prediction is None else prediction
+        return self.observe(jnp.where(valid, displacement, 0.0), thetas), valid
+
+    @cached_property
+    def _decoded(self) -> Callable[[jax.Array], tuple[jax.Array, jax.Array]] | None:
+        """What the observations need of the displacements, at theta (p,), decoded at once."""
+        seen_through = getattr(self.forward, "seen_through", None)
+        return None if seen_through is None else seen_through(self.observe.decoding.matrix)
 
     def evaluate(self, thetas: jax.Array) -> Prediction:
         """Return the displacement (S, k, 3) mm of the observed nodes at ``thetas`` (S, p).
@@ -217,9 +237,7 @@ class Model:
 
     def predict(self, values: Mapping[str, Any]) -> tuple[dict[str, jax.Array], jax.Array]:
         """Return data without noise by observation, and its validity, from each unknown's value."""
-        thetas = self.states.thetas(values)
-        prediction = self.evaluate(thetas)
-        return self.observe(prediction.displacement, thetas), prediction.valid
+        return self.means(self.states.thetas(values))
 
     def predict_stacked(self, values: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
         """Return :meth:`predict` of values (q,) in the order of the unknowns."""

@@ -34,7 +34,7 @@ from emulator.geometry.discretisation import Blocks
 from emulator.mechanics.kinematics import Barriers, Strain, determinant
 from emulator.scenes.part import LocalForce, LocalTerm, Values
 from emulator.scenes.scene import Scene
-from emulator.scenes.tissue import Tissue, factors
+from emulator.scenes.tissue import Tissue
 
 Energy = Callable[[jax.Array, jax.Array], jax.Array]
 
@@ -69,17 +69,16 @@ def volume_ratio(scene: Scene, u: jax.Array) -> jax.Array:
 def parameters_at(scene: Scene, theta: jax.Array) -> Callable[[Tissue], list[jax.Array]]:
     """Return the law's parameters as a function of a point's tissue, at ``theta`` (p,).
 
-    A region scales the moduli that the law names in ``shape_moduli``.
+    The tissue's stiffness scales the moduli that the law names in ``shape_moduli``.
     """
     require_rest(scene)
     values, law = scene.resolve(theta), scene.law
-    scale = factors(scene.regions, values)
 
     def parameters(at: Tissue) -> list[jax.Array]:
-        regional = {}
-        if scale is not None:
-            regional = {name: scale[at.region] * values[name] for name in law.shape_moduli}
-        return [regional.get(name, values[name]) for name in law.parameters]
+        scaled = {}
+        if at.stiffness is not None:
+            scaled = {name: at.stiffness * values[name] for name in law.shape_moduli}
+        return [scaled.get(name, values[name]) for name in law.parameters]
 
     return parameters
 

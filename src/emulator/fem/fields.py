@@ -3,7 +3,7 @@ r"""Stress, strain and fibre stretch of each element, for pictures and tables.
 .. math::
     P = \partial W / \partial F + P_a, \quad \sigma = P F^T / J, \quad E = (F^T F - I)/2
 
-with :math:`P_a` the stress of active tension.
+with :math:`P_a` the stress that loads add, of muscle or as the tissue lies.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from emulator.fem.compiled import compiled
 from emulator.fem.energy import at_points, displacement_gradient, energy_of_gradient
 from emulator.geometry.fibres import unit
 from emulator.mechanics.kinematics import determinant
+from emulator.scenes.tissue import stiffness_of
 
 if TYPE_CHECKING:
     from emulator.scenes.scene import Scene
@@ -37,7 +38,7 @@ def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np
     -------
     ``J`` (m,), ``cauchy_stress`` (m, 3, 3) in kPa, ``green_lagrange`` (m, 3, 3); with fibres also
     ``fibres`` and ``deformed_fibres`` (m, 3), both of unit length, and ``fibre_stretch`` (m,); with
-    regions also ``regions`` (m,).
+    regions or modes of stiffness also ``regions`` (m,) and the factor ``stiffness`` (m,).
     """
     means = compiled(partial(_means, scene))(jnp.asarray(u), jnp.asarray(theta))
     fields = {name: np.asarray(values) for name, values in means.items()}
@@ -45,6 +46,9 @@ def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np
         fields[name] = unit(fields[name])
     if scene.regions is not None:
         fields["regions"] = scene.regions
+    stiffness = stiffness_of(scene.regions, scene.stiffness_modes, scene.resolve(theta))
+    if stiffness is not None:
+        fields["stiffness"] = np.asarray(stiffness)
     return fields
 
 
@@ -54,10 +58,10 @@ def _means(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, jax.Array]
     F = H + jnp.eye(3, dtype=H.dtype)
     J = at_points(determinant, F)
     P = _first_piola(scene, H, theta)
-    if scene.fibres is not None:
-        values, fibres = scene.resolve(theta), scene.fibres_at(theta)
-        active = (load.first_piola(F, scene.mesh, fibres, values) for load in scene.loads)
-        P = sum((stress for stress in active if stress is not None), P)
+    values = scene.resolve(theta)
+    fibres = None if scene.fibres is None else scene.fibres_at(theta)
+    given = (load.first_piola(F, scene.mesh, fibres, values) for load in scene.loads)
+    P = sum((stress for stress in given if stress is not None), P)
     # Round-off leaves sigma slightly asymmetric; eigenvalue routines need it symmetric.
     sigma = _symmetric(P @ jnp.swapaxes(F, -1, -2)) / J[..., None, None]
     fields = {
@@ -65,7 +69,7 @@ def _means(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, jax.Array]
         "cauchy_stress": sigma,
         "green_lagrange": _symmetric(H + 0.5 * jnp.swapaxes(H, -1, -2) @ H),
     }
-    if scene.fibres is not None:
+    if fibres is not None:
         along = jnp.einsum("mqij,mqj->mqi", F, fibres)
         fields |= {"fibres": fibres, "deformed_fibres": along}
         fields["fibre_stretch"] = jnp.linalg.norm(along, axis=-1)

@@ -122,17 +122,33 @@ def read_body(source: str | Path | Any, *, quadratic: bool = False) -> Body:
 def read_regions(path: str | Path, name: str) -> np.ndarray:
     """Return the whole number (m,) of each element of a file from its cell data ``name``."""
     with _content(path) as content:
-        if name not in content.cell_data:
-            names = ", ".join(f"'{key}'" for key in content.cell_data) or "none"
-            raise InputError(f"it has no cell data '{name}' for regions; has {names}")
-        values = content.get_cell_data(name, _tetrahedra(content))
+        values = _cell_data(content, name, "regions")
         if values.ndim != 1 or not (values == np.round(values)).all():
             raise InputError(f"'{name}' are not one whole number for each element")
         return values.astype(np.int64)
 
 
+def read_modes(path: str | Path, name: str) -> np.ndarray:
+    """Return modes of stiffness (m, k) of a file from its cell data ``name``."""
+    with _content(path) as content:
+        values = _cell_data(content, name, "stiffness modes")
+        return values.reshape(len(values), -1).astype(float)
+
+
+def _cell_data(content: meshio.Mesh, name: str, what: str) -> np.ndarray:
+    if name not in content.cell_data:
+        names = ", ".join(f"'{key}'" for key in content.cell_data) or "none"
+        raise InputError(f"it has no cell data '{name}' for {what}; has {names}")
+    return content.get_cell_data(name, _tetrahedra(content))
+
+
 def write_mesh(
-    path: str | Path, mesh: Mesh, fibres: np.ndarray | None = None, sheets: np.ndarray | None = None
+    path: str | Path,
+    mesh: Mesh,
+    fibres: np.ndarray | None = None,
+    sheets: np.ndarray | None = None,
+    regions: np.ndarray | None = None,
+    stiffness_modes: np.ndarray | None = None,
 ) -> None:
     """Write mesh, named sets and directions, to be read back by :func:`read_body`.
 
@@ -142,6 +158,8 @@ def write_mesh(
     mesh : in mm.
     fibres, sheets : unit directions (m, 3) or (m, q, 3), the latter written as 3 q components; not
         in .msh, where meshio cannot read them.
+    regions, stiffness_modes : the whole number (m,) and the modes (m, k) of each element, as cell
+        data of these names; not in .msh either.
 
     Raises
     ------
@@ -150,8 +168,13 @@ def write_mesh(
         a node set and a facet set of one name; for .xdmf, facet sets of a quadratic mesh.
     """
     directions = {
-        name: np.asarray(values).reshape(len(mesh.elements), -1)
-        for name, values in (("fibres", fibres), ("sheets", sheets))
+        name: _flat(np.asarray(values))
+        for name, values in (
+            ("fibres", fibres),
+            ("sheets", sheets),
+            ("regions", regions),
+            ("stiffness_modes", stiffness_modes),
+        )
         if values is not None
     }
     file, suffix, own = f"mesh file {path}", Path(path).suffix, _own_node_sets(mesh)
@@ -192,9 +215,13 @@ def write_solution(
     """
     cells = {}
     for name, values in fields.items():
-        array = np.asarray(values)
-        cells[name] = [array.reshape(len(array), -1) if array.ndim == 3 else array]
+        cells[name] = [_flat(np.asarray(values))]
     write_vtu(path, mesh, point_data={"displacement": np.asarray(displacement)}, cell_data=cells)
+
+
+def _flat(array: np.ndarray) -> np.ndarray:
+    """Return cell data (m, ...) with one axis of components at most."""
+    return array.reshape(len(array), -1) if array.ndim > 2 else array
 
 
 def write_vtu(path: str | Path, mesh: Mesh, **data: Any) -> None:
@@ -373,7 +400,7 @@ def _with_marks(mesh: Mesh, own: Sets, directions: Sets) -> meshio.Mesh:
         rows = np.unique(np.concatenate([*mesh.facet_sets.values()]), axis=0)
         blocks.append((triangle, rows))
         for values in data.values():
-            values.append(np.zeros((len(rows), values[0].shape[1])))
+            values.append(np.zeros((len(rows), *values[0].shape[1:]), values[0].dtype))
         none = np.zeros(len(mesh.elements), np.int32)
         for name, facets in mesh.facet_sets.items():
             data[MARK + name] = [none, mark(find_rows(facets, rows), len(rows))]

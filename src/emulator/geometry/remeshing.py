@@ -42,7 +42,10 @@ class Unmeshable(InputError):
 
 
 def triangulate(
-    loops: Sequence[np.ndarray], size: float | Callable[[float, float], float]
+    loops: Sequence[np.ndarray],
+    size: float | Callable[[float, float], float],
+    *,
+    filled: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return points (n, 2) and triangles (t, 3) of a plane region between polygons.
 
@@ -50,6 +53,7 @@ def triangulate(
 
     loops : (k, 2) corners in order, of the outer polygon and of those cut out of it.
     size : edge length inside, in the corners' unit, or a function of x and y.
+    filled : whether what is cut out is meshed, too.
     """
     _check_polygons(loops)
     with _model() as gmsh:
@@ -64,6 +68,8 @@ def triangulate(
             rings.append(geo.addCurveLoop(list(tags)))
             first += len(loop)
         geo.addPlaneSurface(rings)
+        for ring in rings[1:] if filled else ():
+            geo.addPlaneSurface([ring])
         geo.synchronize()
         if callable(size):
             gmsh.model.mesh.setSizeCallback(lambda _dim, _tag, x, y, _z, _size: size(x, y))
@@ -89,12 +95,20 @@ def _check_polygons(loops: Sequence[np.ndarray]) -> None:
     if (apart & apart.T).any():
         raise Unmeshable("two rims cross")
     for loop in loops[1:]:
-        (x, y), (a, b) = loop[0], (loops[0], np.roll(loops[0], -1, axis=0))
-        above = (a[:, 1] > y) != (b[:, 1] > y)
-        steps = np.where(above, b[:, 1] - a[:, 1], 1.0)
-        crossed = above & (x < a[:, 0] + (y - a[:, 1]) / steps * (b[:, 0] - a[:, 0]))
-        if crossed.sum() % 2 == 0:
+        if not within(loop[:1], loops[0])[0]:
             raise Unmeshable("a rim is outside of the one around it")
+
+
+def within(points: np.ndarray, polygon: np.ndarray) -> np.ndarray:
+    """Return whether each of points (d, 2) lies within a polygon (k, 2), (d,) bool.
+
+    A ray along x crosses the sides an odd number of times.
+    """
+    (x, y), (a, b) = points.T[..., None], (polygon, np.roll(polygon, -1, axis=0))
+    above = (a[:, 1] > y) != (b[:, 1] > y)
+    steps = np.where(above, b[:, 1] - a[:, 1], 1.0)
+    crossed = above & (x < a[:, 0] + (y - a[:, 1]) / steps * (b[:, 0] - a[:, 0]))
+    return crossed.sum(axis=1) % 2 == 1
 
 
 def tetrahedralise(

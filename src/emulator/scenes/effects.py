@@ -19,7 +19,7 @@ from emulator.geometry.fibres import of_elements
 from emulator.geometry.refinement import corner_parents, to_linear
 from emulator.scenes.scene import Scene
 from emulator.scenes.scene_data import directions_read
-from emulator.scenes.tissue import effective_angles, region_quantities
+from emulator.scenes.tissue import effective_angles, stiffness_quantities
 
 
 class Effect(NamedTuple):
@@ -108,6 +108,8 @@ def _changes(scene: Scene) -> Iterator[tuple[str, dict[str, Any], str]]:
             yield name, {field: tuple(remaining)}, remedy
     if scene.regions is not None:
         yield "regional stiffness", {"regions": None}, "leave out regions"
+    if scene.stiffness_modes is not None:
+        yield "a field of stiffness", {"stiffness_modes": None}, "leave out stiffness_modes"
     if scene.dilatation != "pointwise":
         name = f"{scene.dilatation} dilatation"
         yield name, {"dilatation": "pointwise"}, 'dilatation = "pointwise"'
@@ -124,16 +126,16 @@ def _change(scene: Scene, **changes: Any) -> Scene | None:
 
     Directions, rotations, parameters and constants that nothing reads any more are left out.
     """
-    law, loads, supports, regions = (
+    law, loads, supports, regions, modes = (
         changes.get(field, getattr(scene, field))
-        for field in ("law", "loads", "supports", "regions")
+        for field in ("law", "loads", "supports", "regions", "stiffness_modes")
     )
     if not loads and not scene.prescribed.moves:
         return None
     for kind, reader in directions_read(law, loads).items():
         changes[kind] = None if reader is None else changes.get(kind, getattr(scene, kind))
     changes["angles"] = effective_angles(scene.angles, changes["fibres"], changes["sheets"])
-    names_read = {*law.parameters, *(q.name for q in region_quantities(regions))}
+    names_read = {*law.parameters, *(q.name for q in stiffness_quantities(regions, modes))}
     for part in (*loads, *supports, *changes["angles"]):
         names_read |= {quantity.name for quantity in part.quantities}
     try:

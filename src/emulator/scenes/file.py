@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from emulator.core.errors import InputError, look_up
-from emulator.geometry.io import Body, read_body, read_mesh, read_regions
+from emulator.geometry.io import Body, read_body, read_mesh, read_modes, read_regions
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.refinement import to_quadratic
 from emulator.geometry.side_by_side import check_name, shifted, side_by_side
@@ -62,6 +62,8 @@ def read_scene(path: str | Path) -> Scene:
     else:
         read = _several_bodies if file.bodies else _one_body
         body, regions = read(path.parent, file, law, source)
+    with source.at("stiffness_modes"):
+        modes = _modes(path.parent, file)
     mesh, fibres, sheets = _with_planes(body.mesh, file, source), body.fibres, body.sheets
     if file.fibres is not None:
         with source.at("fibres", table=("fibres",)):
@@ -84,6 +86,7 @@ def read_scene(path: str | Path) -> Scene:
             angles=file.fibres.angles_in(mesh) if file.fibres is not None else (),
             sheets=sheets if law.sheets else None,
             regions=regions,
+            stiffness_modes=modes,
             parameters=tuple(parameters),
             loads=loads,
             supports=supports,
@@ -101,7 +104,7 @@ def _specimen(
     folder: Path, file: SceneFile, tube: Tube | None, source: Source
 ) -> tuple[Body, tuple[Support, ...], tuple[Load, ...]]:
     """Return the states of the table ``specimen`` as bodies, and what holds and pulls them."""
-    for key in ("mesh", "bodies", "regions", "supports", "loads", "order"):
+    for key in ("mesh", "bodies", "regions", "stiffness_modes", "supports", "loads", "order"):
         if key in source.data:
             raise source.error("a specimen has none; it is held and moved by its table", (key,))
     with source.at("specimen"):
@@ -138,6 +141,15 @@ def _one_body(folder: Path, file: SceneFile, law: Law, source: Source) -> tuple[
     with source.at("regions"):
         regions = None if file.regions is None else read_regions(folder / file.mesh, file.regions)
     return body, regions
+
+
+def _modes(folder: Path, file: SceneFile) -> np.ndarray | None:
+    """Return the modes of stiffness of a scene's mesh."""
+    if file.stiffness_modes is None:
+        return None
+    if file.mesh is None:
+        raise InputError("only a scene of one mesh has modes of stiffness; give its 'mesh'")
+    return read_modes(folder / file.mesh, file.stiffness_modes)
 
 
 def _several_bodies(

@@ -102,7 +102,7 @@ class SceneFile(Table):
     tube: TubeTable | None = None
     """of a specimen that is a tube, whose table has radii and stretch_axial."""
     parameters: dict[str, ParameterTable]
-    """what varies: parameters of the law, of loads and of regions."""
+    """what varies: parameters of the law, of loads and of the stiffness."""
     supports: tuple[Annotated[BoundaryCondition, OneOf("kind", SUPPORTS, "held")], ...] = ()
     """what holds the body; a table without a kind holds a node set. A specimen has none."""
     loads: tuple[Annotated[Load, OneOf("kind", LOADS)], ...] = ()
@@ -117,6 +117,9 @@ class SceneFile(Table):
     regions: str | None = None
     """cell data of the mesh file with a whole number for each tetrahedron, e.g. gmsh:physical; with
     several bodies also body: 1, 2, ... in their order."""
+    stiffness_modes: str | None = None
+    """cell data of the mesh file with k numbers for each tetrahedron: the change of the logarithm
+    of the stiffness for a size of 1 of each mode; sizes are stiffness_mode_1 to k."""
     fibres: Annotated[FibreRule, OneOf("rule", FIBRE_RULES)] | None = None
     """a rule for fibres and sheets; without it they come from the mesh file."""
     loaded_by: dict[str, str] = Field(default_factory=dict)

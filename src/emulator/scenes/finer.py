@@ -58,6 +58,11 @@ def finer(scene: Scene) -> Finer:
     _, fixed, per_unit = scene.prescribed
     displacements: dict[str | None, np.ndarray] = {None: refinement.carry(fixed)}
     displacements |= {name: refinement.carry(each) for name, each in per_unit.items()}
+
+    def inherited(of_elements: np.ndarray | None) -> np.ndarray | None:
+        """Return what each finer element has from its parent."""
+        return None if of_elements is None else np.repeat(of_elements, refinement.children, axis=0)
+
     fine = replace(
         scene,
         mesh=mesh,
@@ -66,7 +71,8 @@ def finer(scene: Scene) -> Finer:
         angles=angles,
         # A finer mesh is quadratic, and patches are for linear elements.
         dilatation="mean" if scene.dilatation == "patch" else scene.dilatation,
-        regions=None if scene.regions is None else np.repeat(scene.regions, refinement.children),
+        regions=inherited(scene.regions),
+        stiffness_modes=inherited(scene.stiffness_modes),
         supports=tuple(support.on_finer(mesh, displacements) for support in scene.supports),
         origin={"scene": FINER, "of": dict(scene.origin)} if scene.origin else {},
     )

@@ -70,6 +70,7 @@ def identity_of(scene: SceneData) -> Identity:
         directions[f"axis of rotation {k}"] = rotation.axis
         for name, share in rotation.shares.items():
             directions[f"share of {name} in rotation {k}"] = share[..., None]
+    directions["stiffness modes"] = scene.stiffness_modes
     springs = [support.to_json() for support in scene.supports]
     description = {
         "law": law_identity(scene.law),

@@ -158,6 +158,8 @@ class Load(Part):
     """Whether the load reads fibre directions, which the scene must then have."""
     has_potential: ClassVar[bool] = True
     """Whether the load's work is a potential of the displacement."""
+    shared: ClassVar[bool] = False
+    """Whether its parameter is the body's, one for all load states."""
 
     @property
     def pressed(self) -> str | None:
@@ -198,7 +200,7 @@ class Load(Part):
         return None
 
     def first_piola(
-        self, F: jax.Array, mesh: Mesh, fibres: jax.Array, values: Mapping[str, jax.Array]
+        self, F: jax.Array, mesh: Mesh, fibres: jax.Array | None, values: Mapping[str, jax.Array]
     ) -> jax.Array | None:
         """Return the stress (m, q, 3, 3) in kPa added to the law's at F (m, q, 3, 3), or None."""
         return None

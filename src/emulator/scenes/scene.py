@@ -27,7 +27,7 @@ from emulator.geometry.facets import Cavity, encloses
 from emulator.scenes.identity import Identity, fingerprint, identity_of
 from emulator.scenes.parameter_space import ParameterSpace
 from emulator.scenes.scene_data import SceneData
-from emulator.scenes.tissue import Fibres, Tissue, at_every_point, turned
+from emulator.scenes.tissue import Fibres, Tissue, at_every_point, stiffness_of, turned
 
 ENDOCARDIUM = "endocardium"
 """The facet set that is a cavity's wall also where no pressure acts on it."""
@@ -114,29 +114,29 @@ class Scene(SceneData, TableRepr):
 
     def tissue_at(self, theta: jax.Array) -> Tissue:
         """Return material data at ``theta`` (p,), stacked over elements and points, (m, q, ...)."""
-        tissue = self._tissue
-        if tissue.directions is None:
-            return tissue
-        directions = turned(tissue.directions, self.angles, self.resolve(theta))
-        return tissue._replace(directions=directions)
+        directions, values = self._tissue.directions, self.resolve(theta)
+        if directions is not None:
+            directions = turned(directions, self.angles, values)
+        stiffness = stiffness_of(self.regions, self.stiffness_modes, values)
+        if stiffness is not None:
+            points = len(quadrature_points(self.mesh.order))
+            stiffness = jnp.broadcast_to(stiffness[:, None], (len(stiffness), points))
+        return Tissue(directions, stiffness)
 
     def block_tissue_at(self, theta: jax.Array) -> Tissue:
         """Return material data at ``theta`` (p,) stacked over :attr:`blocks`, (b, q, ...)."""
-        if not self.angles:
+        if not self.angles and self.regions is None and self.stiffness_modes is None:
             return self._block_tissue
         return jax.tree.map(self.blocks.gather, self.tissue_at(theta))
 
     @cached_property
     def _tissue(self) -> Tissue:
         # NumPy arrays: JAX arrays made inside jit would be tracers, and a scene keeps these.
-        order, region = self.mesh.order, None
+        order = self.mesh.order
         directions = self.fibres_at_points if self.law.fibres else None
         if directions is not None and self.sheets is not None:
             directions = np.stack([directions, at_every_point(self.sheets, order)], axis=2)
-        if self.regions is not None:
-            index = np.unique(self.regions, return_inverse=True)[1][:, None]
-            region = np.broadcast_to(index, (len(index), len(quadrature_points(order))))
-        return Tissue(cast(Any, directions), cast(Any, region))
+        return Tissue(cast(Any, directions))
 
     @cached_property
     def _block_tissue(self) -> Tissue:

@@ -26,9 +26,10 @@ from emulator.scenes.supports.dirichlet import check_motions, prescribe
 from emulator.scenes.tissue import (
     FibreAngles,
     at_every_point,
+    checked_modes,
     checked_regions,
     effective_angles,
-    region_quantities,
+    stiffness_quantities,
 )
 from emulator.scenes.tube import Tube
 
@@ -61,6 +62,8 @@ class SceneData:
     regions : (m,) whole number of the region each element lies in. Region 3 takes a parameter or a
         constant ``stiffness_3``, by which the law's energy there is multiplied, except its
         volumetric part; see :mod:`emulator.scenes.tissue`.
+    stiffness_modes : (m, k) change of the logarithm of the stiffness, likewise, for a size of 1 of
+        each mode, in each element. The sizes are parameters ``stiffness_mode_1`` to k.
     fibre_rule : the rule by which the directions of this mesh were made, which gives those of
         another mesh of the body (:mod:`emulator.scenes.finer`).
     angles : parameters that turn fibres and sheets (:mod:`emulator.scenes.tissue`), one
@@ -91,6 +94,7 @@ class SceneData:
     loaded_by: Mapping[str, str] = field(default_factory=dict)
     grips: Grips | None = None
     tube: Tube | None = None
+    stiffness_modes: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         for name in ("constants", "origin", "loaded_by"):
@@ -129,7 +133,8 @@ class SceneData:
     @property
     def load_parameters(self) -> tuple[str, ...]:
         """Entries of theta that belong to loads or move supports; the others are the body's."""
-        names = {quantity.name for load in self.loads for quantity in load.quantities}
+        own = (load for load in self.loads if not load.shared)
+        names = {quantity.name for load in own for quantity in load.quantities}
         names |= set(self.prescribed.per_unit)
         return tuple(parameter.name for parameter in self.parameters if parameter.name in names)
 
@@ -148,7 +153,8 @@ class SceneData:
             parameter that no load has.
         """
         owners = {q.name: (q, f"law '{self.law.name}'") for q in self.law.quantities}
-        owners |= {q.name: (q, "a region") for q in region_quantities(self.regions)}
+        of_tissue = stiffness_quantities(self.regions, self.stiffness_modes)
+        owners |= {quantity.name: (quantity, "the stiffness") for quantity in of_tissue}
         groups = (("the fibres'", self.angles), ("load", self.loads), ("support", self.supports))
         for noun, parts in groups:
             of_other_kinds = set(owners)
@@ -177,6 +183,9 @@ class SceneData:
         mesh, tissue = self.mesh, dict[str, Any](fibres=None, sheets=None)
         if self.regions is not None:
             tissue["regions"] = checked_regions(self.regions, len(mesh.elements), self.law)
+        if self.stiffness_modes is not None:
+            modes = checked_modes(self.stiffness_modes, len(mesh.elements), self.law)
+            tissue["stiffness_modes"] = modes
         for kind, reader in directions_read(self.law, self.loads).items():
             directions = getattr(self, kind)
             if directions is None and reader is not None:

@@ -1,12 +1,15 @@
-r"""Material data that differ from point to point: fibres, sheets, and regions of other stiffness.
+r"""Material data that differ from point to point: fibres, sheets, and stiffness.
 
-In region k of a scene that has regions, the law's energy is multiplied by the factor :math:`s_k`,
+In region k of a scene that has regions, and where modes :math:`\varphi_j` of stiffness have the
+sizes :math:`z_j`, the law's energy is multiplied by a factor,
 
 .. math::
-    W = s_k\, W_\text{shape} + U(J),
+    W = s\, W_\text{shape} + U(J), \qquad
+    s = s_k \exp\Big(\sum_j \varphi_j(x)\, z_j\Big),
 
-its volumetric part excepted: a soft region is as nearly incompressible as a stiff one. Energies are
-proportional to their ``shape_moduli``, so the factor multiplies these.
+its volumetric part excepted: soft tissue is as nearly incompressible as a stiff one. Energies are
+proportional to their ``shape_moduli``, so the factor multiplies these. Regions have sharp edges;
+modes make a smooth field (:mod:`emulator.geometry.random_field`).
 
 Parameters may turn fibres and sheets. At a point with the unit axis :math:`n`, a direction d given
 at angle zero becomes
@@ -46,11 +49,11 @@ class Tissue(NamedTuple):
     """Material data of one point, or stacked over elements and their points, axes (m, q).
 
     directions : the fibre (3,), or fibre and sheet (2, 3); None without fibres.
-    region : the index () of the point's region among the factors; None without regions.
+    stiffness : the factor () on the law's shape moduli; None where it is 1 everywhere.
     """
 
     directions: jax.Array | None = None
-    region: jax.Array | None = None
+    stiffness: jax.Array | None = None
 
 
 def at_every_point(directions: np.ndarray, order: int) -> np.ndarray:
@@ -61,17 +64,43 @@ def at_every_point(directions: np.ndarray, order: int) -> np.ndarray:
     return np.broadcast_to(directions[:, None], (len(directions), points, 3))
 
 
-def factors(regions: np.ndarray | None, values: Mapping[str, Any]) -> jax.Array | None:
-    """Return the stiffness factor (k,) of each region, by ascending label; None without regions."""
-    if regions is None:
-        return None
-    return jnp.stack([jnp.asarray(values[q.name]) for q in region_quantities(regions)])
+def stiffness_of(
+    regions: np.ndarray | None, modes: np.ndarray | None, values: Mapping[str, Any]
+) -> jax.Array | None:
+    """Return the factor (m,) on the stiffness of each element; None without regions and modes.
+
+    Parameters
+    ----------
+    regions, modes : the labels (m,) and modes (m, k) of a scene.
+    values : the parameters of the scene by name.
+    """
+    of_regions, of_modes = (
+        jnp.stack([jnp.asarray(values[q.name]) for q in each]) if each else None
+        for each in (stiffness_quantities(regions, None), stiffness_quantities(None, modes))
+    )
+    factor = None
+    if of_regions is not None:
+        assert regions is not None
+        factor = of_regions[np.unique(regions, return_inverse=True)[1]]
+    if of_modes is not None:
+        field = jnp.exp(jnp.asarray(modes) @ of_modes)
+        factor = field if factor is None else factor * field
+    return factor
 
 
-def region_quantities(regions: np.ndarray | None) -> tuple[Quantity, ...]:
-    """Return the factors of ``regions`` (m,), by ascending label: ``stiffness_1`` and so on."""
+def stiffness_quantities(
+    regions: np.ndarray | None, modes: np.ndarray | None
+) -> tuple[Quantity, ...]:
+    """Return the factors of regions, ``stiffness_1``, and sizes of modes, ``stiffness_mode_1``.
+
+    regions, modes : the labels (m,), whose factors come by ascending label, and modes (m, k).
+    """
     labels = () if regions is None else np.unique(regions).tolist()
-    return tuple(number(f"stiffness_{label}") for label in labels)
+    count = 0 if modes is None else modes.shape[1]
+    return (
+        *(number(f"stiffness_{label}") for label in labels),
+        *(number(f"stiffness_mode_{k + 1}", -np.inf) for k in range(count)),
+    )
 
 
 def checked_regions(regions: object, elements: int, law: Law) -> np.ndarray:
@@ -83,12 +112,27 @@ def checked_regions(regions: object, elements: int, law: Law) -> np.ndarray:
         raise InputError(f"regions have shape {labels.shape}; expected ({elements},)")
     if labels.min() < 0:
         raise InputError(f"regions go down to {labels.min()}; expected labels from 0 up")
+    _check_scaled(law, "regions")
+    return frozen_array(labels, int)
+
+
+def checked_modes(modes: object, elements: int, law: Law) -> np.ndarray:
+    """Return read-only modes of stiffness (m, k), as :func:`checked_regions` does labels."""
+    array = np.asarray(modes, dtype=float)
+    if array.ndim != 2 or len(array) != elements or not array.shape[1]:
+        raise InputError(f"stiffness modes have shape {array.shape}; expected ({elements}, k)")
+    if not np.isfinite(array).all():
+        raise InputError("stiffness modes are not finite everywhere")
+    _check_scaled(law, "stiffness modes")
+    return frozen_array(array)
+
+
+def _check_scaled(law: Law, what: str) -> None:
     if not law.shape_moduli:
         raise InputError(
-            f"law '{law.name}' says no shape_moduli, so regions cannot scale it apart from its "
+            f"law '{law.name}' says no shape_moduli, so {what} cannot scale it apart from its "
             "resistance to volume change"
         )
-    return frozen_array(labels, int)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -26,6 +26,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.sparse import csr_array
 
 from emulator.catalogue import scene_from_origin
 from emulator.core.display import TableRepr
@@ -177,6 +178,36 @@ class CachedEmulator:
     def evaluate(self, theta: jax.Array) -> Prediction:
         """Return the displacement, and whether ``theta`` is inside the box of the training."""
         return inside_only(self, theta)
+
+    def seen_through(self, matrix: csr_array) -> Callable[[jax.Array], Any] | None:
+        """Return a function of theta (p,): the values (r,) of ``matrix @ u``, and their validity.
+
+        matrix : (r, 3 k), of the displacement u (3 k,) of the nodes. It is multiplied by the modes
+            once, so that nothing else of the displacement is computed.
+
+        None where the displacement is not a sum of modes.
+        """
+        part, scene, rows = self.part, self.scene, csr_array(matrix)
+        if part.decode is not None:
+            return None
+        held = scene.held[self.nodes].ravel()
+        free = csr_array(rows.multiply(~held[None]))
+        modes = free @ part.modes.reshape(len(part.modes), -1).T
+        prescribed = {
+            name: rows @ np.where(held, each[self.nodes].ravel(), 0.0)
+            for name, each in scene.prescribed.per_unit.items()
+        }
+        fixed = rows @ np.where(held, scene.held_displacement[self.nodes].ravel(), 0.0)
+        offset = free @ part.offset.ravel() + fixed
+
+        def values(theta: jax.Array) -> tuple[jax.Array, jax.Array]:
+            inside = scene.space.contains(theta)
+            safe = jnp.where(inside, theta, scene.centre)
+            found = offset + modes @ self.coefficients(safe)
+            at = scene.resolve(safe)
+            return found + sum(at[name] * each for name, each in prescribed.items()), inside
+
+        return values
 
     def at(self, nodes: np.ndarray) -> CachedEmulator:
         """Return the same map over ``nodes``, which must be among those cached."""

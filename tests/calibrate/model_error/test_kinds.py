@@ -17,7 +17,7 @@ from calibrate.statistical_model.errors import with_described_errors
 from emulator.core.errors import InputError
 from emulator.scenes import Scene
 from linear_support import linear_forward
-from scene_support import block
+from scene_support import between_plates, block
 
 NODES = [3, 11, 20]
 A, B = "displacement@a", "displacement@b"
@@ -334,3 +334,86 @@ def test_a_posterior_kept_with_shares_of_data_is_refused_in_one_line(model, data
     old = {name: value for name, value in error.words.items() if name != "shares"}
     with pytest.raises(InputError, match="older than systematic errors that are shares of pred"):
         ModelError.restore(error.arrays(), old)
+
+
+@pytest.fixture(scope="module")
+def frames():
+    """Three nodes of a block in the plane, in three states of a plate that moves."""
+    scene = between_plates()
+    seen = cal.nodal_displacements(scene, [30, 41, 52])
+    names = [f"displacement@{k}" for k in range(3)]
+    known = {f"shear@{k}": amount for k, amount in enumerate((0.1, 0.2, 0.4))}
+    known |= {f"stretch@{k}": 0.0 for k in range(3)}
+    rng = np.random.default_rng(2)
+    data = {name: 0.1 * rng.normal(size=(3, 3)) for name in names}
+    for values in data.values():
+        values[:, 2] = np.nan  # a camera sees the plane
+    model = cal.model(
+        linear_forward(scene), dict.fromkeys(names, seen), cal.GaussianNoise(sd=0.02),
+        known=known, check_scale=False,
+    )  # fmt: skip
+    return model, data
+
+
+@pytest.mark.parametrize("along", [None, 0.15])
+@pytest.mark.parametrize("inferred", [False, True])
+def test_an_error_of_a_field_has_the_covariance_it_is_declared_with(frames, along, inferred):
+    model, data = frames
+    size = {"sd_scale": 0.2} if inferred else {"sd": 0.05}
+    field = {"kind": "field", "of": "displacement", "along": "shear", "length": 1.5, "share": 0.0}
+    given, present = with_described_errors(
+        model,
+        data,
+        {"dic": {**field, **size, **({} if along is None else {"along_length": along})}},
+    )
+    points, amounts = model.observe.parts["displacement@0"].points, np.array([0.1, 0.2, 0.4])
+
+    def matern(distance, length):
+        return (1.0 + np.sqrt(3.0) * distance / length) * np.exp(-np.sqrt(3.0) * distance / length)
+
+    in_space = matern(np.linalg.norm(points[:, None] - points[None], axis=2), 1.5)
+    in_time = np.outer(amounts, amounts) / 0.16
+    if along is not None:
+        in_time *= matern(np.abs(amounts[:, None] - amounts[None]), along)
+    # Both components of the plane err alike, and not together.
+    covariance = 0.05**2 * np.kron(in_time, np.kron(in_space, np.eye(2))) + 0.02**2 * np.eye(18)
+    draw = {"mu": 3.0} | ({"field_sd": 0.05} if inferred else {})
+    assert set(given.names) == set(draw)
+    means, _ = given.predict(draw)
+    residual = np.concatenate([np.asarray(present[n] - means[n]) for n in sorted(present)])
+    expected = multivariate_normal(np.zeros(18), covariance).logpdf(residual)
+    # Matern's correlation without its smallest modes: the sum is cut at 1e-8 of the largest.
+    assert float(given.map_log_likelihood(draw, present)) == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_share_of_the_variance_may_be_left_out(frames):
+    model, data = frames
+    field = {"kind": "field", "of": "displacement", "along": "shear", "length": 1.5, "sd": 0.05}
+    sizes = {}
+    for share in (0.0, 0.4):
+        given, _ = with_described_errors(model, data, {"dic": {**field, "share": share}})
+        modes = given.error.modes
+        sizes[share] = len(modes), float(np.sum(modes**2))
+    assert sizes[0.4][0] < sizes[0.0][0]
+    assert 0.6 <= sizes[0.4][1] / sizes[0.0][1] < 1.0
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"sd": None}, "give either sd"),
+        ({"length": -1.0}, "length is -1.0"),
+        ({"along_length": 0.0}, "along_length is 0.0"),
+        ({"share": 1.0}, "share is 1.0"),
+        ({"along": "mu"}, "'mu' is not known"),
+        ({"along": "stretch"}, "'stretch' is 0 in every state"),
+        ({"along": "none"}, "'none' is no parameter"),
+    ],
+)
+def test_a_field_that_cannot_be_is_refused_in_a_line(frames, change, words):
+    model, data = frames
+    field = {"kind": "field", "of": "displacement", "along": "shear", "length": 1.5, "sd": 0.05}
+    entries = {k: v for k, v in {**field, **change}.items() if v is not None}
+    with pytest.raises(InputError, match=words) as error:
+        with_described_errors(model, data, {"dic": entries})
+    assert "\n" not in str(error.value)

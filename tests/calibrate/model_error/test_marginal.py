@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from calibrate.model_error.marginal import Amplitude, ModelError, VaryingModes, diagonal
+from calibrate.model_error.marginal import Amplitude, ModelError, SizedModes, VaryingModes, diagonal
+from emulator.core.errors import InputError
 
 MEANS = {"a": jnp.array([1.0, -2.0]), "b": jnp.array([[3.0, 0.5], [1.5, -1.0]])}
 RESIDUAL = {"a": jnp.array([0.3, 0.1]), "b": jnp.array([[-0.2, 0.4], [0.0, 0.7]])}
@@ -32,10 +33,8 @@ def error_of(information, fixed):
         shares=0.3 * rng.normal(size=(4, 6)),
         sized=np.array([0.0, 1.0, 1.0, 0.0]),
         information=np.asarray(first.information_left(jnp.asarray(information), jnp.zeros(0), {})),
-        name="size",
-        scale=0.5,
     )
-    return replace(first, varying=varying)
+    return replace(first, varying=varying, size_name="size", size_scale=0.5)
 
 
 @pytest.fixture(scope="module", params=[0, 3], ids=["varying", "fixed and varying"])
@@ -71,6 +70,41 @@ def test_noise_of_each_number_alone_may_be_a_vector(error):
         for W in (of_each, np.diag(of_each))
     )
     np.testing.assert_allclose(ratio(by_vector, 0.3), ratio(dense_too, 0.3), rtol=1e-12)
+
+
+@pytest.mark.parametrize("fixed", [0, 3])
+@pytest.mark.parametrize("alone", [False, True], ids=["correlated noise", "independent noise"])
+def test_modes_of_an_inferred_size_are_the_same_once_they_are_made_diagonal(
+    information, fixed, alone
+):
+    W = np.diagonal(information) if alone else information
+    whole = np.diag(W) if alone else W
+    rng = np.random.default_rng(5)
+    before, V = rng.normal(size=(fixed, 6)), rng.normal(size=(4, 6))
+    weights, strength, modes, mixing = diagonal(before, W)
+    first = ModelError(weights, strength, modes, mixing=mixing, size_name="size", size_scale=0.5)
+    error = replace(first, sized=SizedModes(*diagonal(V, W, first)[:3]))
+    C = np.linalg.inv(whole)
+    residual = np.concatenate([np.ravel(RESIDUAL["a"]), np.ravel(RESIDUAL["b"])])
+    for size in (0.0, 0.4, 2.0):
+        S = C + before.T @ before + size**2 * V.T @ V
+        expected = [multivariate_normal(np.zeros(6), each).logpdf(residual) for each in (S, C)]
+        assert float(ratio(error, size)) == pytest.approx(expected[0] - expected[1], rel=1e-10)
+        left = error.information_left(jnp.asarray(whole), jnp.array([size]), MEANS)
+        np.testing.assert_allclose(left, np.linalg.inv(S), atol=1e-10)
+    largest = error.largest(MEANS)
+    np.testing.assert_allclose(
+        largest.T @ largest, before.T @ before + 1.5**2 * V.T @ V, atol=1e-10
+    )
+    keys = jax.random.split(jax.random.key(0), 40_000)
+    drawn = jax.vmap(lambda key: error.draw(key, jnp.array([0.4]), MEANS))(keys)
+    flat = np.concatenate([np.reshape(drawn[n] - MEANS[n], (len(keys), -1)) for n in MEANS], axis=1)
+    np.testing.assert_allclose(np.cov(flat.T), before.T @ before + 0.16 * V.T @ V, atol=0.2)
+    back = ModelError.restore(error.arrays(), error.words)
+    assert back.fingerprint == error.fingerprint
+    assert back.priors.keys() == {"size"}
+    with pytest.raises(InputError, match="'size' is inferred"):
+        error.unknowns(RESIDUAL)
 
 
 def test_it_is_differentiable_and_batched(error):

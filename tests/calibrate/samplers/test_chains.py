@@ -4,12 +4,14 @@ import threading
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from calibrate.samplers import Context, NUTSOptions, density_of
-from calibrate.samplers.chains import Programs
+from calibrate.samplers.chains import Chains, Programs
 from calibrate.samplers.nuts import NUTS
-from linear_support import linear_problem
+from linear_support import PRIOR_MEAN, PRIOR_SD, closed_form, linear_forward, linear_problem
 
 
 def test_chains_run_side_by_side_and_draw_what_they_draw_alone(beam):
@@ -42,3 +44,25 @@ def test_chains_run_side_by_side_and_draw_what_they_draw_alone(beam):
         return NUTS.sample(replace(posterior, at_once=at_once), data, options, Context(seed=3))
 
     np.testing.assert_array_equal(drawn(3).z, drawn(1).z)
+
+
+def test_of_many_unknowns_chains_begin_white_at_a_mode(beam):
+    model, data = linear_problem(beam)
+    assert not density_of(model).whitened  # it has two
+    posterior = replace(density_of(model), piloted=False, whitened=True)
+    chains = Chains(NUTS, posterior, data, NUTSOptions(draws=20, warmup=20), Context(seed=3))
+    chains.begin(jax.random.key(0))
+    mode, root = chains.map_.centre, np.asarray(chains.map_.root)
+    of_z = lambda z: posterior.log_density(z, data)
+    np.testing.assert_allclose(root.T @ jax.grad(of_z)(mode), 0.0, atol=0.3)
+    np.testing.assert_allclose(root.T @ jax.hessian(of_z)(mode) @ root, -np.eye(2), atol=1e-4)
+    of_w = chains.programs.start(jax.random.split(jax.random.key(1), 2), data, chains.map_)[1]
+    assert (of_w > of_z(mode) - 10.0).all()  # they start near it
+    forward = linear_forward(beam)
+    mean, covariance = closed_form(forward, [3, 11, 20], data, 0.1, PRIOR_MEAN, PRIOR_SD)
+    drawn = NUTS.sample(posterior, data, NUTSOptions(draws=400, warmup=100), Context(seed=3)).z
+    values = posterior.constrain(jnp.asarray(drawn.reshape(-1, 2)))
+    for k, name in enumerate(beam.parameter_names):
+        sd = float(np.sqrt(covariance[k, k]))
+        assert float(values[name].mean()) == pytest.approx(mean[k], abs=0.2 * sd)
+        assert float(values[name].std()) == pytest.approx(sd, rel=0.15)

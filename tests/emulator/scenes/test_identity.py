@@ -10,7 +10,15 @@ from emulator.mechanics.laws import LAWS
 from emulator.mechanics.laws.law import law_identity, probed
 from emulator.scenes import Parameter, Support
 from emulator.scenes.identity import _as_set
-from emulator.scenes.loads import LOADS, ActiveTension, Force, Gravity, GravityVector, Traction
+from emulator.scenes.loads import (
+    LOADS,
+    ActiveTension,
+    Force,
+    Gravity,
+    GravityVector,
+    Prestress,
+    Traction,
+)
 from emulator.scenes.supports import SUPPORTS, ElasticSupport
 from scene_support import block
 
@@ -174,6 +182,7 @@ PARTS = {
         ActiveTension(),
         {"tension": 3.0, "parameter": "contractility", "transverse": 0.2, "within": "left"},
     ),
+    "prestress": (Prestress(), {"tension": 3.0, "normal": "y", "parameter": "tight"}),
     "held": (
         Support("bottom", np.array([0.1, 0.0, 0.0]), amount="shear"),
         {

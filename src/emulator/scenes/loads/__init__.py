@@ -15,6 +15,7 @@ from emulator.scenes.loads.pressure import (
     SurfacePressure,
     ValvePressure,
 )
+from emulator.scenes.loads.prestress import Prestress
 from emulator.scenes.loads.traction import Traction
 from emulator.scenes.part import Load
 
@@ -31,6 +32,7 @@ LOADS: dict[str, type[Load]] = {
         DeadPressure,
         PublishedPressure,
         ActiveTension,
+        Prestress,
     )
 }
 
@@ -45,6 +47,7 @@ __all__ = [
     "Gravity",
     "GravityVector",
     "Load",
+    "Prestress",
     "PublishedPressure",
     "SurfacePressure",
     "Traction",

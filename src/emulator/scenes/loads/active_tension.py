@@ -102,7 +102,9 @@ class ActiveTension(Load):
         return "active tension", None
 
     @override
-    def first_piola(self, F: jax.Array, mesh: Mesh, fibres: jax.Array, values: Values) -> jax.Array:
+    def first_piola(
+        self, F: jax.Array, mesh: Mesh, fibres: jax.Array | None, values: Values
+    ) -> jax.Array:
         along = jnp.einsum("mqij,mqj,mqk->mqik", F, fibres, fibres)
         stress = self.value(values) * (along + self.transverse * (F - along))
         return stress * self._contracts(mesh)[:, None, None, None]
@@ -113,10 +115,7 @@ class ActiveTension(Load):
         connectivity, (gradients, weights, along) = self._muscle(grid, fibres)
 
         def of_spring(u: jax.Array, spring: Any, values: Values) -> jax.Array:
-            stiffness, D = spring
-            delta = u[1] - u[0]
-            work = jnp.vdot(D, delta) + 0.5 * jnp.vdot(delta, delta)
-            return self.value(values) * stiffness * work
+            return self.value(values) * energy_of_spring(u, spring)
 
         def growth(h: jax.Array, weight: jax.Array, f: jax.Array) -> jax.Array:
             """Return the growth of the measures from rest, without cancellation for small h."""
@@ -133,10 +132,12 @@ class ActiveTension(Load):
 
         if along.angles:
             return (LocalTerm(connectivity, (gradients, weights, along), of_element, convex=True),)
-        pairs, stiffness = self._springs(connectivity, gradients, weights, along.directions)
-        X = grid.mesh.nodes
-        springs = (stiffness, X[pairs[:, 1]] - X[pairs[:, 0]])
-        return (LocalTerm(pairs, springs, of_spring, convex=True),)
+        f, X = along.directions, grid.mesh.nodes
+        unit = (1.0 - self.transverse) * f[..., :, None] * f[..., None, :]
+        unit = unit + self.transverse * np.eye(3)
+        pairs, stiffness = springs(connectivity, gradients, weights, unit)
+        ends = (stiffness, X[pairs[:, 1]] - X[pairs[:, 0]])
+        return (LocalTerm(pairs, ends, of_spring, convex=True),)
 
     @override
     def on_loaded(
@@ -178,22 +179,38 @@ class ActiveTension(Load):
         elements = np.flatnonzero(self._contracts(grid.mesh))
         return jax.tree.map(lambda array: array[elements], muscle)
 
-    def _springs(
-        self, connectivity: np.ndarray, gradients: Any, weights: Any, fibres: Any
-    ) -> tuple[np.ndarray, Any]:
-        """Return nodes (k, 2) and stiffness ``-k_ab`` (k,) in mm of springs, for a tension of 1.
 
-        The stiffness is a traced array where the grid is traced, else a NumPy array.
-        """
-        traced = any(isinstance(a, jax.core.Tracer) for a in (gradients, weights, fibres))
-        xp: Any = jnp if traced else np
-        along = xp.einsum("mqai,mqi->mqa", gradients, fibres)
-        stiffness = (1.0 - self.transverse) * xp.einsum("mq,mqa,mqb->mab", weights, along, along)
-        if self.transverse:
-            stiffness += self.transverse * xp.einsum(
-                "mq,mqai,mqbi->mab", weights, gradients, gradients, optimize=True
-            )
-        one, other = np.triu_indices(connectivity.shape[1], 1)
-        ends = np.sort(connectivity[:, np.stack([one, other], axis=1)], axis=2).reshape(-1, 2)
-        pairs, spring_of_pair = np.unique(ends, axis=0, return_inverse=True)
-        return pairs, -sums(len(pairs), spring_of_pair, stiffness[:, one, other])
+def springs(
+    connectivity: np.ndarray, gradients: Any, weights: Any, stress: Any
+) -> tuple[np.ndarray, Any]:
+    """Return the springs between nodes whose energy is that of a given stress at rest.
+
+    Parameters
+    ----------
+    connectivity : (m, a) nodes of the elements.
+    gradients, weights : (m, q, a, 3) 1/mm and (m, q) mm3, of their shape functions.
+    stress : the second Piola-Kirchhoff stress of size 1, symmetric, (3, 3) or (m, q, 3, 3).
+
+    Returns
+    -------
+    pairs : (k, 2) nodes of each spring.
+    stiffness : ``-k_ab`` (k,) in mm, a traced array where an argument is traced, else of NumPy.
+    """
+    traced = any(isinstance(a, jax.core.Tracer) for a in (gradients, weights, stress))
+    xp: Any = jnp if traced else np
+    stressed = xp.matmul(gradients, stress)
+    stiffness = xp.einsum("mq,mqai,mqbi->mab", weights, stressed, gradients, optimize=True)
+    one, other = np.triu_indices(connectivity.shape[1], 1)
+    ends = np.sort(connectivity[:, np.stack([one, other], axis=1)], axis=2).reshape(-1, 2)
+    pairs, spring_of_pair = np.unique(ends, axis=0, return_inverse=True)
+    return pairs, -sums(len(pairs), spring_of_pair, stiffness[:, one, other])
+
+
+def energy_of_spring(u: jax.Array, spring: tuple[jax.Array, jax.Array]) -> jax.Array:
+    """Return the energy () in mm3 of a spring at size 1, ``stiffness (D . delta + |delta|^2 / 2)``.
+
+    spring : its stiffness () in mm, and the vector D (3,) mm between its nodes at rest.
+    """
+    stiffness, D = spring
+    delta = u[1] - u[0]
+    return stiffness * (jnp.vdot(D, delta) + 0.5 * jnp.vdot(delta, delta))

@@ -1,0 +1,245 @@
+r"""Displacements of many points over many frames, as image correlation gives them.
+
+A camera sees the plane: of each point two components, and not in every frame. Each frame is a load
+state whose amount, the motion of what pulls the body, was measured with it. The points lie on one
+surface of the body, so their place across the plane follows from theirs in it, and what is observed
+is ``landmarks`` (:mod:`calibrate.measurements.displacements`) whose third component is missing.
+
+Tables are read in three forms: a CSV file of points (``point,x,y``) and one of displacements
+(``frame,point,ux,uy``); an ``.npz`` with ``points`` (n, 2), ``displacement`` (frames, n, 2) and
+``frames``; or a folder of the text matrices ``x.txt``, ``y.txt``, ``ux.txt`` and ``uy.txt``, a row
+a point and a column a frame. Lengths are in mm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from calibrate.measurements.collection import Observations, observations
+from calibrate.measurements.displacements import Landmarks
+from calibrate.state_names import in_state
+from emulator.core.cells import Cells, read_cells
+from emulator.core.errors import InputError
+from emulator.scenes.scene import Scene
+
+_FOLLOWS = (
+    0.9  # correlation of the points' mean motion with what pulls them, where frames are right
+)
+_MATRICES = ("x", "y", "ux", "uy")
+
+
+@dataclass(frozen=True)
+class FullField:
+    """Displacements of points over frames.
+
+    points : the places of the points before they move, (n, 2) mm.
+    displacement : the displacements, (S, n, 2) mm; NaN where a point is not seen.
+    frames : the names of the frames, (S,).
+    """
+
+    points: np.ndarray
+    displacement: np.ndarray
+    frames: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        shape = (len(self.frames), len(self.points), 2)
+        if self.points.shape != shape[1:] or self.displacement.shape != shape:
+            raise InputError(
+                f"full field: points have shape {self.points.shape}, displacements "
+                f"{self.displacement.shape}, and there are {len(self.frames)} frames; expected "
+                "(n, 2) and (frames, n, 2)"
+            )
+        if not np.isfinite(self.points).all() or np.isinf(self.displacement).any():
+            raise InputError("full field: a place is not finite, or a displacement is infinite")
+
+    def only(self, frames: Sequence[str], points: np.ndarray | None = None) -> FullField:
+        """Return the field of some frames, in this order, and of the points with these numbers.
+
+        :class:`InputError` for a frame that is not there.
+        """
+        for frame in frames:
+            if frame not in self.frames:
+                raise InputError(
+                    f"full field: there is no frame '{frame}'; there are {self.frames[0]} to "
+                    f"{self.frames[-1]}"
+                )
+        rows = [self.frames.index(frame) for frame in frames]
+        kept = slice(None) if points is None else points
+        return FullField(self.points[kept], self.displacement[rows][:, kept], tuple(frames))
+
+
+def read_full_field(points: str | Path, displacements: str | Path | None = None) -> FullField:
+    """Return the full field of a CSV file of points and one of displacements, or of one source.
+
+    Parameters
+    ----------
+    points : a CSV file ``point,x,y``; or alone an ``.npz`` file, or a folder of text matrices.
+    displacements : a CSV file ``frame,point,ux,uy``; rows may be missing.
+
+    Raises
+    ------
+    InputError
+        A file that is not there or not readable, a column or matrix that is missing, a point that
+        the points' file does not have or that is twice in one frame.
+    """
+    source = Path(points)
+    if not source.exists():
+        raise InputError(f"full field: {source} does not exist")
+    if displacements is not None:
+        return _of_tables(source, Path(displacements))
+    if source.is_dir():
+        return _of_matrices(source)
+    if source.suffix != ".npz":
+        raise InputError(f"full field: {source} has points; name the file of displacements, too")
+    try:
+        with np.load(source, allow_pickle=False) as file:
+            arrays = {name: np.asarray(file[name]) for name in file.files}
+    except (OSError, ValueError) as error:
+        raise InputError(f"full field: {source} is not a readable .npz file") from error
+    for name in ("points", "displacement", "frames"):
+        if name not in arrays:
+            raise InputError(f"full field: {source} has no array '{name}'")
+    frames = tuple(str(frame) for frame in arrays["frames"].tolist())
+    return FullField(arrays["points"].astype(float), arrays["displacement"].astype(float), frames)
+
+
+def _of_tables(points: Path, displacements: Path) -> FullField:
+    places, moved = (
+        _cells(points, ("point", "x", "y")),
+        _cells(displacements, ("frame", "point", "ux", "uy")),
+    )
+    rows, number = {}, 0
+    for row, cell in places.rows.items():
+        if cell["point"] in rows:
+            raise InputError(f"data file {points}: row {row}, point '{cell['point']}' is twice")
+        rows[cell["point"]], number = number, number + 1
+    X = np.array([[places.number(row, word) for word in ("x", "y")] for row in places.rows])
+    frames = tuple(dict.fromkeys(cell["frame"] for cell in moved.rows.values()))
+    index = {frame: k for k, frame in enumerate(frames)}
+    u = np.full((len(frames), len(X), 2), np.nan)
+    seen = np.zeros(u.shape[:2], bool)
+    for row, cell in moved.rows.items():
+        if cell["point"] not in rows:
+            raise InputError(
+                f"data file {displacements}: row {row}, point '{cell['point']}' is not in {points}"
+            )
+        at = index[cell["frame"]], rows[cell["point"]]
+        if seen[at]:
+            raise InputError(
+                f"data file {displacements}: row {row}, point '{cell['point']}' is twice in frame "
+                f"'{cell['frame']}'"
+            )
+        u[at], seen[at] = [moved.number(row, word, gaps=True) for word in ("ux", "uy")], True
+    return FullField(X, u, frames)
+
+
+def _of_matrices(folder: Path) -> FullField:
+    arrays = {}
+    for name in _MATRICES:
+        path = folder / f"{name}.txt"
+        if not path.is_file():
+            raise InputError(f"full field: {path} does not exist; a folder has x, y, ux and uy.txt")
+        try:
+            arrays[name] = np.loadtxt(path, ndmin=2)
+        except ValueError as error:
+            raise InputError(f"full field: {path} is no matrix of numbers") from error
+    u = (
+        np.stack([arrays["ux"].T, arrays["uy"].T], axis=-1)
+        if (arrays["ux"].shape == arrays["uy"].shape)
+        else np.zeros((0, 0, 2))
+    )
+    points = np.column_stack([arrays["x"][:, 0], arrays["y"][:, 0]])
+    return FullField(points, u, tuple(str(k) for k in range(len(u))))
+
+
+def _cells(path: Path, words: Sequence[str]) -> Cells:
+    if not path.is_file():
+        raise InputError(f"data file {path} does not exist")
+    cells = read_cells(path)
+    for word in words:
+        if word not in cells.words:
+            raise InputError(
+                f"data file {path}: column '{word}' is missing; expected {','.join(words)}"
+            )
+    return cells
+
+
+def read_amounts(path: str | Path, column: str) -> dict[str, float]:
+    """Return the number in ``column`` of each frame, from a CSV file with a column ``frame``."""
+    cells = _cells(Path(path), ("frame", column))
+    return {cell["frame"]: cells.number(row, column) for row, cell in cells.rows.items()}
+
+
+def read_curve(path: str | Path, amount: str, value: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return amounts (k,) that rise, and values (k,), from two columns of a CSV file."""
+    cells = _cells(Path(path), (amount, value))
+    pairs = np.array([[cells.number(row, word) for word in (amount, value)] for row in cells.rows])
+    pairs[:, 0] = np.abs(pairs[:, 0])
+    order = np.argsort(pairs[:, 0], kind="stable")
+    return pairs[order, 0], pairs[order, 1]
+
+
+def spread_points(points: np.ndarray, count: int) -> np.ndarray:
+    """Return the numbers (count,) of points (n, ...), each the farthest from those before it.
+
+    :class:`InputError` where there are fewer.
+    """
+    if not 1 <= count <= len(points):
+        raise InputError(f"{count} points; there are {len(points)}")
+    chosen = [0]
+    ways = np.linalg.norm(points - points[0], axis=1)
+    for _ in range(count - 1):
+        chosen.append(int(np.argmax(ways)))
+        ways = np.minimum(ways, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return np.array(chosen)
+
+
+def field_data(
+    scene: Scene, field: FullField, amounts: Mapping[str, float], facet_set: str = "top"
+) -> tuple[Observations, dict[str, np.ndarray]]:
+    """Return the observations of a full field, ``displacement@frame``, and their data.
+
+    Parameters
+    ----------
+    scene : the scene of the body, the points' plane being its plane of x and y.
+    field : the points in the scene's frame, and their displacements from the shape of its mesh.
+    amounts : what pulls the body, by frame: as ``displacement`` in mm, so that its order can be
+        compared with that of the frames.
+    facet_set : the facets on which the points lie, at one z.
+
+    Raises
+    ------
+    InputError
+        A facet set that is not flat, a point outside, a frame without an amount, or displacements
+        that do not follow the amounts.
+    """
+    z = scene.mesh.nodes[np.unique(scene.mesh.facet_set(facet_set))][:, 2]
+    if np.ptp(z) > 1e-6 * scene.mesh.size:
+        raise InputError(f"facet set '{facet_set}' is not at one z; a full field is of a plane")
+    for frame in field.frames:
+        if frame not in amounts:
+            raise InputError(f"full field: frame '{frame}' has no amount; give one for each")
+    _check_order(field, np.array([amounts[frame] for frame in field.frames]))
+    part = Landmarks.of(scene, np.column_stack([field.points, np.full(len(field.points), z[0])]))
+    data = {
+        in_state("displacement", frame): np.column_stack([u, np.full(len(u), np.nan)])
+        for frame, u in zip(field.frames, field.displacement, strict=True)
+    }
+    return observations(dict.fromkeys(data, part)), data
+
+
+def _check_order(field: FullField, amounts: np.ndarray) -> None:
+    """Raise :class:`InputError` where the points do not move as what pulls them."""
+    if len(amounts) < 4 or np.ptp(amounts) == 0.0:
+        return
+    moved = np.nanmean(np.linalg.norm(field.displacement, axis=2), axis=1)
+    following = float(np.corrcoef(moved, np.abs(amounts))[0, 1])
+    if not following > _FOLLOWS:
+        raise InputError(
+            f"full field: the points' motion over {len(amounts)} frames correlates with the "
+            f"amounts by {following:.2f} only; are the frames in the order of the amounts?"
+        )

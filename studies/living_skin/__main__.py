@@ -1,0 +1,266 @@
+"""Living skin between two pads: how stiff is a scar beside its skin?
+
+    python -m studies.living_skin --data DIR          # DIR has keloid_points.csv and so on
+    python -m studies.living_skin --data DIR --quick --out OUT
+    python -m studies.living_skin --judge DIR         # DIR has the frames that were kept apart
+
+Writes results.json, with 90 % bands of 60 points and of the force at motions of the pad that were
+kept apart, and living_skin.png. It takes Gmsh.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from studies.common.output import Case, Results, parser, run
+from studies.living_skin.bands import Bands, bands_of, judged
+from studies.living_skin.figures import draw
+from studies.living_skin.skin import (
+    FORCE,
+    HEALTHY,
+    KELOID,
+    LAWS,
+    Measured,
+    Skin,
+    data_of,
+    measured_of,
+    scene_of,
+)
+from studies.living_skin.twins import coverage, twins_of
+
+import calibrate as cal
+import emulator as em
+from calibrate.statistical_model.errors import with_described_errors
+from emulator.core.errors import InputError
+from emulator.fem.fields import element_fields
+from emulator.scenes import Scene
+from emulator.training import recipe, train
+
+HERE = Path(__file__).parent
+SEED = 61
+POINTS, RUNS, FEWER = 60, 120, 60  # points as data; FEM runs with a field, and without
+ERROR_LENGTH = 5.0  # mm, over which what model and correlation miss correlates
+ALONG = 2.0  # mm of the pad's motion, likewise
+SD, FORCE_SD = 0.02, 0.004  # mm, N: what each number errs by itself
+CERTIFIED = 48
+TWINS = 40
+_CERTIFIED = (
+    "verdict", "reason", "findings", "draws", "failed", "shift", "shift_error", "map_errors",
+)  # fmt: skip
+
+
+def emulated(scene: Scene, folder: Path, runs: int) -> tuple[em.Emulator, Case]:
+    """The emulator of a scene, and its error; one that is in ``folder`` is kept."""
+    if not (folder / "emulator.json").is_file():
+        began = perf_counter()
+        plan = replace(recipe("mechanics"), simulations=runs, order=1, seed=SEED)
+        emulator = train(scene, plan, folder, progress=True)
+        em.save_emulator(emulator, folder)
+        print(f"trained in {perf_counter() - began:.0f} s", flush=True)
+    emulator = em.load(folder, scene)
+    of = emulator.record["discrepancy"]
+    return emulator, {
+        "nodes": len(scene.mesh.nodes),
+        "parameters": len(scene.parameters),
+        "runs": of["runs"],
+        "err_u_mm": of["held_out"]["err_u"],
+        "err_R_N": of["held_out"]["err_R"],
+    }
+
+
+def model_of(
+    scene: Scene, forward: Any, measured: Measured, frames: tuple[str, ...], **which: bool,
+) -> tuple[cal.Model, Any]:  # fmt: skip
+    """The model of some frames, and their data."""
+    observe, data, known = data_of(scene, measured, frames, **which)
+    noise = {"displacement": cal.GaussianNoise(sd=SD), FORCE: cal.GaussianNoise(sd=FORCE_SD)}
+    modes = [name for name in scene.parameter_names if "mode" in name]
+    prior = {name: cal.truncated_normal(0.0, 1.0, -2.5, 2.5) for name in modes}
+    noise = {name: each for name, each in noise.items() if name in observe.bases}
+    model = cal.model(forward, observe, noise, prior, known=known)
+    if "displacement" not in observe.bases:
+        return model, data
+    error = {
+        "kind": "field", "of": "displacement", "along": "pull", "length": ERROR_LENGTH,
+        "along_length": ALONG, "sd_scale": 0.1,
+    }  # fmt: skip
+    return with_described_errors(model, data, {"missed": error})
+
+
+def posterior_of(model: cal.Model, data: Any, sampler: str, quick: bool) -> cal.Posterior:
+    """The posterior by NUTS, or near its mode."""
+    draws = 50 if quick else 250
+    options: Any = cal.NUTSOptions(warmup=draws, draws=draws, chains=2, rounds=1)
+    if sampler == "laplace":
+        options = cal.LaplaceOptions(starts=2)
+    return cal.sample(model, data, sampler=sampler, options=options, seed=SEED, predictions=False)
+
+
+def told_by(found: cal.Posterior) -> Case:
+    """Means and sds of what is no mode, and the quality of the draws."""
+    summary = found.summary()
+    return {
+        "posterior": {name: row for name, row in summary.items() if "mode" not in name},
+        "modes": {
+            name: [round(row["mean"], 3), round(row["sd"], 3)]
+            for name, row in summary.items()
+            if "mode" in name
+        },
+        "divergences": found.divergences,
+        "r_hat": max(float(row["r_hat"]) for row in summary.values()),
+        "box": [str(end) for end in found.box_ends()],
+    }
+
+
+def stiffness_map(found: cal.Posterior, scene: Scene) -> Case:
+    """Mean and sd of the logarithm of mu s, s the factor of each element of the region."""
+    state = found.model.states.states[0]
+    thetas = found.thetas(state)[:: max(1, len(found.thetas(state)) // 200)]
+    rest = jnp.zeros(scene.held.shape)
+    first = next(name for name in scene.parameter_names if name in scene.law.shape_moduli)
+    logs = [
+        np.log(element_fields(scene, rest, theta)["stiffness"] * scene.resolve(theta)[first])
+        for theta in thetas[:60]
+    ]
+    inside = np.flatnonzero(scene.regions == 1)
+    middles = scene.mesh.nodes[scene.mesh.corners].mean(axis=1)[inside, :2]
+    of = np.array(logs)[:, inside]
+    return {
+        "middles_mm": middles.round(2).tolist(),
+        "mean_log_kpa": of.mean(axis=0).round(3).tolist(),
+        "sd": of.std(axis=0).round(3).tolist(),
+    }
+
+
+def main() -> None:
+    """Run the study."""
+    words = parser(__doc__, HERE)
+    words.add_argument("--data", type=Path, help="folder of the tables")
+    words.add_argument("--judge", type=Path, metavar="DIR", help="folder of what was kept apart")
+    words.add_argument("--keep", type=Path, help="folder that keeps meshes and emulators")
+    words.add_argument("--twins", type=int, default=TWINS, help=f"number of twins ({TWINS})")
+    arguments = words.parse_args()
+    if arguments.judge is not None:
+        there = json.loads((arguments.out / "results.json").read_text())
+        for skin in (KELOID, HEALTHY):
+            case = next(case for case in there["cases"] if case["name"] == f"{skin.name}, bands")
+            print(json.dumps({skin.name: judged(skin, case, arguments.judge)}, indent=2))
+        return
+    if arguments.data is None:
+        raise InputError("give --data DIR, the folder of the tables")
+    quick, data = arguments.quick, arguments.data
+    keep = arguments.keep or arguments.out / "kept"
+    results = Results(arguments.out, SEED, again=arguments.again, settings={"quick": quick})
+    modes, runs, fewer = (4, 16, 12) if quick else (23, RUNS, FEWER)
+
+    @cache
+    def measured(skin: Skin) -> Measured:
+        return measured_of(skin, data, 20 if quick else POINTS)
+
+    def frames_of(skin: Skin, count: int | None = None) -> tuple[str, ...]:
+        return tuple(measured(skin).frame_at(amount) for amount in skin.amounts[:count])
+
+    @cache
+    def with_law(skin: Skin, law: str) -> tuple[Scene, Any, Case]:
+        folder = keep / f"{skin.name}_{law}"
+        scene = scene_of(skin, data, folder, law, modes)
+        emulator, told = emulated(scene, folder / "emulator", runs)
+        return scene, emulator.cache(), told
+
+    @cache
+    def inferred(
+        skin: Skin, law: str, frames: tuple[str, ...], sampler: str, which: Sequence[str] = ()
+    ) -> cal.Posterior:
+        scene, forward, _ = with_law(skin, law)
+        only = {name: name in which for name in ("field", "force")} if which else {}
+        model, given = model_of(scene, forward, measured(skin), frames, **only)
+        return posterior_of(*model.given(given), sampler, quick)
+
+    def timed(found: Any) -> Case:
+        began = perf_counter()
+        return {**found(), "seconds": perf_counter() - began}
+
+    def held_out(law: str) -> Case:
+        """The last frame, predicted from the three before it."""
+        scene, forward, told = with_law(KELOID, law)
+        before, last = frames_of(KELOID, 3), frames_of(KELOID)[-1]
+        found = inferred(KELOID, law, before, "laplace")
+        at = measured(KELOID).amounts[last]
+        bands = bands_of(found, scene, forward, measured(KELOID), before, (at,), (at,))
+        return {**told_by(found), "emulator": told, "held_out": bands.against(measured(KELOID))}
+
+    law = "neo_hookean_split"
+    laws = [law] if quick else list(LAWS)
+    for name in laws:
+        results.case(f"keloid, {name}", lambda n=name: timed(lambda: held_out(n)))
+        jax.clear_caches()
+    best = law
+    if not quick:
+        rows = {n: c for n in laws for c in results.cases if c["name"] == f"keloid, {n}"}
+        best = min(laws, key=lambda n: rows[n]["held_out"]["rms_mm"])
+    sampler = "laplace" if quick else "nuts"
+    for skin in (KELOID, HEALTHY):
+        chosen = best if skin is KELOID else law
+        frames = frames_of(skin)
+
+        def whole(skin: Skin = skin, chosen: str = chosen, frames: Any = frames) -> Case:
+            found = inferred(skin, chosen, frames, sampler)
+            return {**told_by(found), "law": chosen, "emulator": with_law(skin, chosen)[2]}
+
+        def kept_apart(skin: Skin = skin, chosen: str = chosen, frames: Any = frames) -> Case:
+            scene, forward, _ = with_law(skin, chosen)
+            found = inferred(skin, chosen, frames, sampler)
+            made: Bands = bands_of(
+                found, scene, forward, measured(skin), frames, skin.later, skin.later_force
+            )
+            return made.to_json()
+
+        def mapped(skin: Skin = skin, chosen: str = chosen, frames: Any = frames) -> Case:
+            found = inferred(skin, chosen, frames, sampler)
+            return stiffness_map(found, with_law(skin, chosen)[0])
+
+        results.case(skin.name, lambda f=whole: timed(f))
+        results.case(f"{skin.name}, bands", kept_apart)
+        results.case(f"{skin.name}, map", mapped)
+        for which in () if quick else ("field", "force"):
+            results.case(
+                f"{skin.name}, {which} alone",
+                lambda s=skin, w=which, c=chosen, f=frames: told_by(
+                    inferred(s, c, f, "laplace", (w,))
+                ),
+            )
+        jax.clear_caches()
+    folder = keep / "twins"
+    scene = scene_of(KELOID, data, folder, law, 0)
+    emulator, _ = emulated(scene, folder / "emulator", fewer)
+    made = twins_of(
+        scene, emulator.cache(), measured(KELOID), frames_of(KELOID),
+        2 if quick else arguments.twins, results,
+    )  # fmt: skip
+
+    def against_fem() -> Case:
+        scene, _, _ = with_law(KELOID, best)
+        found = inferred(KELOID, best, frames_of(KELOID), sampler)
+        certificate = cal.certify(
+            found, em.Simulator(scene), draws=CERTIFIED, mesh=0, seed=SEED, progress=True
+        )
+        told = certificate.to_json()
+        return {name: told[name] for name in _CERTIFIED}
+
+    if not quick:
+        results.case("certificate", lambda: timed(against_fem))
+    results.write(coverage=coverage(made))
+    draw({case["name"]: case for case in results.cases}, data, arguments.out / "living_skin.png")
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,0 +1,150 @@
+"""Tables of points over frames: three formats, what cannot be, and the data they become."""
+
+import numpy as np
+import pytest
+
+import emulator as em  # noqa: F401 - float64
+from calibrate.measurements.full_field import (
+    FullField,
+    field_data,
+    read_amounts,
+    read_curve,
+    read_full_field,
+    spread_points,
+)
+from emulator.core.errors import InputError
+from scene_support import between_plates
+
+AMOUNTS = {"0": 0.0, "3": 0.5, "6": 1.0, "9": 1.5, "12": 2.0}
+
+
+@pytest.fixture
+def field():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0.5, 3.5, (12, 2))
+    amounts = np.array(list(AMOUNTS.values()))
+    u = amounts[:, None, None] * (0.1 + 0.02 * rng.normal(size=(12, 2)))
+    u[2, 4] = np.nan
+    return FullField(points, u, tuple(AMOUNTS))
+
+
+def tables(folder, field):
+    rows = ["point,x,y"] + [f"{k},{x},{y}" for k, (x, y) in enumerate(field.points)]
+    (folder / "points.csv").write_text("\n".join(rows))
+    rows = ["frame,point,ux,uy"]
+    for frame, u in zip(field.frames, field.displacement, strict=True):
+        rows += [f"{frame},{k},{a},{b}" for k, (a, b) in enumerate(u) if np.isfinite(a)]
+    (folder / "moved.csv").write_text("\n".join(rows))
+    return folder / "points.csv", folder / "moved.csv"
+
+
+def same(found, field, frames=True):
+    np.testing.assert_array_equal(found.points, field.points)
+    np.testing.assert_array_equal(found.displacement, field.displacement)
+    assert not frames or found.frames == field.frames
+
+
+def test_every_format_gives_the_same_field(tmp_path, field):
+    same(read_full_field(*tables(tmp_path, field)), field)
+    np.savez(
+        tmp_path / "f.npz",
+        points=field.points,
+        displacement=field.displacement,
+        frames=np.array(field.frames),
+    )
+    same(read_full_field(tmp_path / "f.npz"), field)
+    folder = tmp_path / "matrices"
+    folder.mkdir()
+    for name, values in {
+        "x": np.repeat(field.points[:, :1], 5, axis=1),
+        "y": np.repeat(field.points[:, 1:], 5, axis=1),
+        "ux": field.displacement[..., 0].T,
+        "uy": field.displacement[..., 1].T,
+    }.items():
+        np.savetxt(folder / f"{name}.txt", values)
+    same(read_full_field(folder), field, frames=False)
+
+
+def test_it_becomes_landmarks_whose_third_component_is_missing(field):
+    scene = between_plates()
+    observe, data = field_data(scene, field, AMOUNTS)
+    assert list(observe.parts) == [f"displacement@{frame}" for frame in AMOUNTS]
+    part = observe.parts["displacement@0"]
+    np.testing.assert_allclose(part.points[:, 2], 4.0)
+    np.testing.assert_array_equal(part.points[:, :2], field.points)
+    for k, name in enumerate(data):
+        np.testing.assert_array_equal(data[name][:, :2], field.displacement[k])
+        assert np.isnan(data[name][:, 2]).all()
+    only = field.only(("6", "3"), np.array([1, 5]))
+    np.testing.assert_array_equal(only.displacement, field.displacement[[2, 1]][:, [1, 5]])
+
+
+def test_amounts_and_curves_are_read_by_name(tmp_path):
+    (tmp_path / "pads.csv").write_text("frame,ux\n0,0\n3,-0.5\n")
+    assert read_amounts(tmp_path / "pads.csv", "ux") == {"0": 0.0, "3": -0.5}
+    (tmp_path / "force.csv").write_text("u,F\n-0.2,-2\n-0.1,-1\n")
+    amounts, force = read_curve(tmp_path / "force.csv", "u", "F")
+    np.testing.assert_array_equal(amounts, [0.1, 0.2])
+    np.testing.assert_array_equal(force, [-1.0, -2.0])
+
+
+def test_points_are_spread_over_the_field():
+    points = np.stack(np.meshgrid(np.arange(9.0), np.arange(9.0)), axis=-1).reshape(-1, 2)
+    chosen = spread_points(points, 9)
+    assert len(set(chosen.tolist())) == 9
+    apart = np.linalg.norm(points[chosen][:, None] - points[chosen], axis=2) + 99.0 * np.eye(9)
+    assert apart.min() >= 3.0
+
+
+def wrong(change):
+    """Return tables that somebody might give."""
+
+    def make(folder, field):
+        points, moved = tables(folder, field)
+        texts = change(points.read_text().split("\n"), moved.read_text().split("\n"))
+        for path, lines in zip((points, moved), texts, strict=True):
+            path.write_text("\n".join(lines))
+        return points, moved
+
+    return make
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (wrong(lambda p, m: (p, [*m, m[-1]])), "is twice in frame '12'"),
+        (wrong(lambda p, m: ([*p, p[-1]], m)), "point '11' is twice"),
+        (wrong(lambda p, m: (p[:-1], m)), "point '11' is not in"),
+        (wrong(lambda p, m: (p, ["frame,point,u,v", *m[1:]])), "column 'ux' is missing"),
+        (wrong(lambda p, m: (["point,x,z", *p[1:]], m)), "column 'y' is missing"),
+        (wrong(lambda p, m: (p, [*m, "12,11,a,b"])), "twice"),
+        (lambda folder, _: (folder / "none.csv",), "does not exist"),
+        (lambda folder, field: (tables(folder, field)[0],), "name the file of displacements"),
+    ],
+)
+def test_tables_that_cannot_be_are_refused_in_a_line(tmp_path, field, make, words):
+    with pytest.raises(InputError, match=words) as error:
+        read_full_field(*make(tmp_path, field))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda f, a: (f, {k: v for k, v in a.items() if k != "9"}), "frame '9' has no amount"),
+        (lambda f, a: (f, dict(zip(a, [2.0, 0.1, 1.5, 0.0, 0.7], strict=True))), "in the order"),
+        (lambda f, a: (FullField(30.0 * f.points, f.displacement, f.frames), a), "instead of mm"),
+        (lambda f, a: (FullField(f.points + 9.0, f.displacement, f.frames), a), "outside the body"),
+        (lambda f, a: (f.only(("3", "99")), a), "no frame '99'"),
+    ],
+)
+def test_fields_that_cannot_be_data_are_refused_in_a_line(field, change, words):
+    with pytest.raises(InputError, match=words) as error:
+        field_data(between_plates(), *change(field, dict(AMOUNTS)))
+    assert "\n" not in str(error.value)
+
+
+def test_frames_without_force_without_its_amount(tmp_path):
+    (tmp_path / "force.csv").write_text("F\n1\n2\n")
+    with pytest.raises(InputError, match="column 'u' is missing"):
+        read_curve(tmp_path / "force.csv", "u", "F")
