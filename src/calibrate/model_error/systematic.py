@@ -117,7 +117,9 @@ def marginalised(
         found = diagonal(_rows(varying, shapes, "modes"), information, fixed)
         return replace(fixed, sized=SizedModes(*found[:3]))
     whole = np.diag(information) if information.ndim == 1 else information
-    left = np.asarray(replace(fixed, size_name="").information_left(jnp.asarray(whole), jnp.zeros(0), {}))
+    left = np.asarray(
+        replace(fixed, size_name="").information_left(jnp.asarray(whole), jnp.zeros(0), {})
+    )
     on_diagonal = np.diagonal(left)
     sized = [np.full(len(error.names), float(error.size is not None)) for error in varying]
     return replace(
