@@ -25,7 +25,7 @@ from emulator.geometry.sheet import mesh_sheet, regions_within
 from emulator.scenes import Scene
 
 THICKNESS = 1.5  # mm, which nobody measured: only stiffness times thickness is told
-MODES, LENGTH, LOG_SD = 23, 10.0, 0.8  # of the field of log stiffness
+LENGTH, LOG_SD = 10.0, 0.8  # of the field of log stiffness
 FORCE = "reaction:moving:x"
 _PAD, _MARGIN, _SIZE = 8.0, 35.0, 2.5  # mm: width of a pad, skin around the pads, edges between
 _OUTLINE = (-29.64, -20.0)  # mm, from the frame of the outline to that of the points
@@ -48,6 +48,8 @@ class Skin:
         of the force.
     inner : the x in mm between which points are taken; nearer to a pad they follow its glue.
     sideways : mm that the moving pad moves along y for each mm along -x.
+    modes : the number of modes of log stiffness between the pads. The healthy skin is pulled twice
+        as far, where skin with soft spots folds beside the pad and has no equilibrium.
     """
 
     name: str
@@ -57,6 +59,7 @@ class Skin:
     later_force: tuple[float, ...]
     inner: tuple[float, float]
     sideways: float
+    modes: int
 
     @property
     def most(self) -> float:
@@ -66,11 +69,11 @@ class Skin:
 
 KELOID = Skin(
     "keloid", 40.727, (0.49, 0.985, 1.465, 1.93), (2.5, 3.0, 3.5, 4.0), (2.5, 3.0, 3.5, 4.0),
-    (1.0, 38.0), -0.034,
+    (1.0, 38.0), -0.034, 23,
 )  # fmt: skip
 HEALTHY = Skin(
     "healthy", 36.495, (0.65, 1.28, 1.93, 2.495), (2.8, 3.2, 3.8), (4.0, 6.0, 8.0),
-    (11.0, 28.7), 0.041,
+    (11.0, 28.7), 0.041, 0,
 )  # fmt: skip
 
 
@@ -80,7 +83,7 @@ def rectangle(left: float, right: float, low: float, high: float) -> np.ndarray:
 
 
 def scene_of(
-    skin: Skin, data: Path, folder: Path, law: str = "neo_hookean_split", modes: int = MODES,
+    skin: Skin, data: Path, folder: Path, law: str = "neo_hookean_split", modes: int = 0,
     size: float = _SIZE, layers: int = 1,
 ) -> Scene:  # fmt: skip
     """The scene, written to ``folder``; a mesh that is there is kept."""
@@ -123,8 +126,10 @@ def _scene_file(skin: Skin, law: str, modes: int, scar: bool) -> str:
         lines += ["[[supports]]", support]
     lines += ["[[loads]]", 'kind = "prestress"']
     ranges = {name: (*each, "log") for name, each in LAWS[law].items()}
-    ranges["foundation"] = ("kPa/mm", 1e-4, 0.05, "log")
+    ranges["foundation"] = ("kPa/mm", 1e-4, 0.05 if modes else 0.01, "log")
     ranges["prestress"] = ("kPa", 0.1, 15.0, "uniform")
+    if not modes:
+        ranges["mu"] = ("kPa", 1.0, 15.0, "log")
     ranges["pull"] = ("", 0.0, skin.most, "uniform")
     if scar:
         ranges["stiffness_1"] = ("", 1.0, 40.0, "log")

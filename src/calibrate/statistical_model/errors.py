@@ -267,9 +267,11 @@ def fit(
 
     unknowns : the unknowns at which FEM was run, (n, q).
     errors : FEM's data less the map's, all observations raveled, (n, d).
-    information : the information W of the noise about its mean, (d, d).
+    information : the information W of the noise about its mean, (d, d), or its diagonal (d,).
     of_mesh : whether FEM was run on a finer mesh.
     """
+    if information.ndim == 1:
+        information = np.diag(information)
     root = np.linalg.cholesky(information)  # W = root root^T
     centre, scale = unknowns.mean(axis=0), np.maximum(unknowns.std(axis=0), 1e-12)
     x, whitened = (unknowns - centre) / scale, errors @ root

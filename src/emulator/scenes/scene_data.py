@@ -153,8 +153,9 @@ class SceneData:
             parameter that no load has.
         """
         owners = {q.name: (q, f"law '{self.law.name}'") for q in self.law.quantities}
-        of_tissue = stiffness_quantities(self.regions, self.stiffness_modes)
-        owners |= {quantity.name: (quantity, "the stiffness") for quantity in of_tissue}
+        owners |= {q.name: (q, "a region") for q in stiffness_quantities(self.regions, None)}
+        of_modes = stiffness_quantities(None, self.stiffness_modes)
+        owners |= {q.name: (q, "a mode of stiffness") for q in of_modes}
         groups = (("the fibres'", self.angles), ("load", self.loads), ("support", self.supports))
         for noun, parts in groups:
             of_other_kinds = set(owners)
