@@ -170,6 +170,38 @@ def one_layer_of(skin: Skin, data: Path, folder: Path) -> Case:
     }
 
 
+def map_against_fem(scene: Scene, forward: Any, told: Case, count: int = 4) -> Case:
+    """Forces of the map and of FEM at theta about a posterior's means, as wide as its sds."""
+    rng, simulator = np.random.default_rng(SEED), em.Simulator(scene)
+    rows = {name: (row["mean"], row["sd"]) for name, row in told["posterior"].items()}
+    rows |= {name: tuple(row) for name, row in told["modes"].items()}
+    force, found = cal.Reaction(scene, "moving", "x"), []
+    for _ in range(count):
+        values = {}
+        for parameter in scene.parameters:
+            if parameter.name in rows:
+                mean, sd = rows[parameter.name]
+                value = mean + sd * float(rng.normal())
+                values[parameter.name] = float(np.clip(value, parameter.low, parameter.high))
+        for pull in (0.985, 1.93, 3.0):
+            theta = scene.theta(**values, pull=pull)
+            u = simulator.solve(theta).require_converged().displacement
+            seen = forward(theta)
+            found.append(
+                {
+                    "pull_mm": pull,
+                    "fem_n": float(force(u[force.nodes], theta)),
+                    "map_n": float(force(seen[force.nodes], theta)),
+                    "err_u_mm": float(jnp.abs(u - seen).max()),
+                }
+            )
+    off = [row["map_n"] / row["fem_n"] - 1.0 for row in found]
+    return {
+        "rows": found,
+        "force_off": {"median": float(np.median(np.abs(off))), "worst": max(map(abs, off))},
+    }
+
+
 def best_of(held_out: dict[str, Case]) -> str:
     """The law that predicts the force best, of those within 5 % of the least error of points."""
     least = min(case["rms_mm"] for case in held_out.values())
@@ -273,6 +305,13 @@ def main() -> None:
 
         results.case(skin.name, lambda f=whole: timed(f))
         results.case(f"{skin.name}, bands", kept_apart)
+
+        def against(skin: Skin = skin, chosen: str = chosen) -> Case:
+            scene, forward, _ = with_law(skin, chosen)
+            told = next(case for case in results.cases if case["name"] == skin.name)
+            return map_against_fem(scene, forward, told)
+
+        results.case(f"{skin.name}, map against FEM", against)
         results.case(f"{skin.name}, map", mapped)
         for which in () if quick else ("field", "force"):
             results.case(
