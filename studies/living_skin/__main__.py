@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from studies.common.output import Case, Results, parser, run
-from studies.living_skin.bands import Bands, bands_of, judged
+from studies.living_skin.bands import ALONG, FORCE_SD, LENGTH, SD, Bands, bands_of, judged
 from studies.living_skin.figures import draw
 from studies.living_skin.skin import (
     FORCE,
@@ -48,9 +48,6 @@ from emulator.training import recipe, train
 HERE = Path(__file__).parent
 SEED = 61
 POINTS, RUNS, FEWER = 60, 120, 60  # points as data; FEM runs with a field, and without
-ERROR_LENGTH = 5.0  # mm, over which what model and correlation miss correlates
-ALONG = 2.0  # mm of the pad's motion, likewise
-SD, FORCE_SD = 0.02, 0.004  # mm, N: what each number errs by itself
 CERTIFIED = 48
 TWINS = 40
 _CERTIFIED = (
@@ -90,7 +87,7 @@ def model_of(
     if "displacement" not in observe.bases:
         return model, data
     error = {
-        "kind": "field", "of": "displacement", "along": "pull", "length": ERROR_LENGTH,
+        "kind": "field", "of": "displacement", "along": "pull", "length": LENGTH,
         "along_length": ALONG, "sd_scale": 0.1,
     }  # fmt: skip
     return with_described_errors(model, data, {"missed": error})

@@ -25,7 +25,11 @@ from emulator.core.gaussian_process import matern32
 from emulator.scenes import Scene
 from emulator.surrogates.protocol import ForwardMap
 
-LENGTH, ALONG, SD, FORCE_SD = 5.0, 2.0, 0.02, 0.004  # as in the study's model
+LENGTH, ALONG = (
+    5.0,
+    2.0,
+)  # mm in space and of the pad's motion, over which what is missed correlates
+SD, FORCE_SD = 0.02, 0.004  # mm, N: what each number errs by itself
 FORCE_SHARE = 0.05  # sd of the force's model error, per doubling of the largest motion of the data
 _DRAWS, _EACH = 100, 20
 

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from studies.common.output import Case, Results
+from studies.living_skin.bands import ALONG, FORCE_SD, LENGTH, SD
 from studies.living_skin.skin import FORCE, Measured
 
 import calibrate as cal
@@ -14,9 +15,9 @@ from emulator.core.errors import SolverError
 from emulator.scenes import Scene
 from emulator.surrogates.protocol import ForwardMap
 
-SIZE, SD, FORCE_SD = 0.05, 0.02, 0.004  # mm, mm, N, of the twins' errors
+SIZE = 0.05  # mm, of the twins' errors that correlate
 _ERROR = {
-    "kind": "field", "of": "displacement", "along": "pull", "length": 5.0, "along_length": 2.0,
+    "kind": "field", "of": "displacement", "along": "pull", "length": LENGTH, "along_length": ALONG,
 }  # fmt: skip
 
 

@@ -37,7 +37,7 @@ COMMANDS = {
     "effects": "analyses",
     "evaluate": "emulators",
     "explore": "serving",
-    "frames": "scene_files",
+    "frames": "frames",
     "identify": "analyses",
     "infer": "posteriors",
     "init": "scene_files",

@@ -104,7 +104,7 @@ class Observations:
 
     @cached_property
     def decoding(self) -> Decoding:
-        """What a map that is linear in its coefficients has to decode, in place of all nodes."""
+        """The matrix by which a sum of modes is decoded at once, in place of all nodes."""
         wholes, groups = dict[str, Observation](), dict[str, list[str]]()
         for name, part in self.parts.items():
             whole = part.restricted(None)
@@ -196,7 +196,7 @@ class Observations:
 
 
 class Decoding(NamedTuple):
-    """What observations need of the displacements of their nodes.
+    """A matrix that linear observations make of the displacements of all nodes, and what is left.
 
     matrix : its product (r,) with the displacements (3 k,) has the data of linear observations, and
         after it the displacements of the nodes of the others.

@@ -147,11 +147,12 @@ def _of_matrices(folder: Path) -> FullField:
             arrays[name] = np.loadtxt(path, ndmin=2)
         except ValueError as error:
             raise InputError(f"full field: {path} is no matrix of numbers") from error
-    u = (
-        np.stack([arrays["ux"].T, arrays["uy"].T], axis=-1)
-        if (arrays["ux"].shape == arrays["uy"].shape)
-        else np.zeros((0, 0, 2))
-    )
+    if arrays["ux"].shape != arrays["uy"].shape:
+        raise InputError(
+            f"full field: {folder} has ux of shape {arrays['ux'].shape} and uy of "
+            f"{arrays['uy'].shape}; expected the same, a row a point and a column a frame"
+        )
+    u = np.stack([arrays["ux"].T, arrays["uy"].T], axis=-1)
     points = np.column_stack([arrays["x"][:, 0], arrays["y"][:, 0]])
     return FullField(points, u, tuple(str(k) for k in range(len(u))))
 

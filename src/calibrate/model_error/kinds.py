@@ -310,12 +310,14 @@ class Field:
         if self.along_length is not None:
             along = curve_modes(amounts, self.along_length)
         grown = along * amounts / np.abs(amounts).max()
-        products = np.einsum("rd,qs->rqsd", spatial_modes(points, self.length), grown)
-        products = products.reshape(-1, len(amounts), len(points))
-        variances = np.sum(products**2, axis=(1, 2))
+        in_space = spatial_modes(points, self.length)
+        # All products of 600 points and 20 states would fill a gigabyte: only those that are kept.
+        variances = np.outer(np.sum(in_space**2, axis=1), np.sum(grown**2, axis=1)).ravel()
         order = np.argsort(-variances)
         carried = np.cumsum(variances[order]) / variances.sum()
-        kept = products[order[: int(np.searchsorted(carried, 1.0 - self.share)) + 1]]
+        used = order[: int(np.searchsorted(carried, 1.0 - self.share)) + 1]
+        space, time = np.divmod(used, len(grown))
+        kept = grown[time][:, :, None] * in_space[space][:, None, :]
         size = None if self.sd_scale is None else ("field_sd", self.sd_scale)
         each_of = np.eye(components)
         rows = np.einsum("rsd,ci->rcsdi", kept * (self.sd or 1.0), each_of)

@@ -8,8 +8,8 @@ That program is one chain's, and as many chains run at once as there are cores. 
 transition of all chains would take as many gradients as the longest trajectory among them
 (docs/experiments.md, "NUTS chains one after the other", "Chains on threads").
 
-Of many unknowns a pilot run would tell too little. There the chains run in coordinates that are
-white at a mode (:func:`calibrate.samplers.laplace.white_at_mode`), where there is one.
+A pilot run tells too little of many unknowns. There the chains run in coordinates that are white
+at a mode (:func:`calibrate.samplers.laplace.white_at_mode`), where there is one.
 
 Chains start at random points, within two units of the centre.
 """

@@ -220,7 +220,7 @@ class Model:
 
     @cached_property
     def _decoded(self) -> Callable[[jax.Array], tuple[jax.Array, jax.Array]] | None:
-        """What the observations need of the displacements, at theta (p,), decoded at once."""
+        """The function of theta (p,) by which the observations are decoded at once, or None."""
         seen_through = getattr(self.forward, "seen_through", None)
         return None if seen_through is None else seen_through(self.observe.decoding.matrix)
 

@@ -159,7 +159,7 @@ class Load(Part):
     has_potential: ClassVar[bool] = True
     """Whether the load's work is a potential of the displacement."""
     shared: ClassVar[bool] = False
-    """Whether its parameter is the body's, one for all load states."""
+    """Whether all load states share its parameter, which is then the body's."""
 
     @property
     def pressed(self) -> str | None:

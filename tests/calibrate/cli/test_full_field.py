@@ -94,4 +94,4 @@ def test_what_cannot_be_is_refused_in_a_line(folder, capsys, words, line):
 def test_a_force_that_ends_before_the_frames_is_refused(folder, capsys):
     (folder / "force.csv").write_text("u,F\n0,0\n-1.5,-0.3\n")
     words = (*FIELD, "--force", "reaction:right:x=force.csv:u:F", "--out", "field.csv")
-    assert "ends at 1.5, frame '9' is at 2" in complaint(capsys, *words)
+    assert "goes from 0 to 1.5, frame '9' is at 2" in complaint(capsys, *words)

@@ -148,3 +148,10 @@ def test_frames_without_force_without_its_amount(tmp_path):
     (tmp_path / "force.csv").write_text("F\n1\n2\n")
     with pytest.raises(InputError, match="column 'u' is missing"):
         read_curve(tmp_path / "force.csv", "u", "F")
+
+
+def test_matrices_of_different_shapes_are_refused(tmp_path):
+    for name, columns in {"x": 2, "y": 2, "ux": 2, "uy": 3}.items():
+        np.savetxt(tmp_path / f"{name}.txt", np.ones((4, columns)))
+    with pytest.raises(InputError, match=r"ux of shape \(4, 2\) and uy of \(4, 3\)"):
+        read_full_field(tmp_path)

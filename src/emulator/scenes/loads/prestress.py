@@ -1,7 +1,7 @@
 r"""Tension that a sheet of tissue is under where it lies, as living skin is.
 
-With the tension :math:`T` in every direction of the plane across the normal n, the law's stress has
-beside it the second Piola-Kirchhoff stress :math:`S = T\,(I - n \otimes n)`, whose energy is
+A tension :math:`T` in every direction of the plane across the normal n adds the second
+Piola-Kirchhoff stress :math:`S = T\,(I - n \otimes n)` to that of the law. Its energy is
 
 .. math:: \Psi = \int_\Omega \frac{T}{2} \left[(I_1 - 3) - (|F n|^2 - 1)\right] dX .
 
