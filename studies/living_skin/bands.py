@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.distance import cdist
 from studies.common.output import Case
-from studies.living_skin.skin import Measured, Skin, measured_of
+from studies.living_skin.skin import Measured, Skin, force_of, measured_of
 
 import calibrate as cal
 from emulator.core.gaussian_process import matern32
@@ -117,8 +117,7 @@ def bands_of(
             [measured.field.points[measured.chosen], np.full(len(measured.chosen), _top(scene))]
         ),
     )
-    reaction = cal.Reaction(scene, "moving", "x")
-    of_points, of_pad = forward.at(part.nodes), forward.at(reaction.nodes)
+    of_points, of_pad = forward.at(part.nodes), force_of(scene, forward)
 
     @jax.jit
     def predicted(theta: jax.Array, motions: jax.Array) -> jax.Array:
@@ -128,7 +127,7 @@ def bands_of(
     @jax.jit
     def pulled(theta: jax.Array, motions: jax.Array) -> jax.Array:
         thetas = jnp.tile(theta, (len(motions), 1)).at[:, pull].set(motions)
-        return jax.vmap(reaction)(jax.vmap(of_pad)(thetas), thetas)
+        return jax.vmap(of_pad)(thetas)
 
     data = measured.field.only(frames, measured.chosen).displacement
     thetas = found.thetas(frames[0])

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 import calibrate as cal
@@ -23,6 +24,7 @@ from emulator.geometry.io import write_mesh
 from emulator.geometry.random_field import matern_modes
 from emulator.geometry.sheet import mesh_sheet, regions_within
 from emulator.scenes import Scene
+from emulator.surrogates.protocol import ForwardMap
 
 THICKNESS = 1.5  # mm, which nobody measured: only stiffness times thickness is told
 LENGTH, LOG_SD = 10.0, 0.8  # of the field of log stiffness
@@ -141,6 +143,13 @@ def _scene_file(skin: Skin, law: str, modes: int, scar: bool) -> str:
     lines += ["[constants]", "kappa = 2000.0", "stiffness_0 = 1.0"]
     lines += [] if scar else ["stiffness_1 = 1.0"]
     return "\n".join(lines) + "\n"
+
+
+def force_of(scene: Scene, forward: ForwardMap) -> Callable[[jax.Array], jax.Array]:
+    """The force in N on the moving pad along x that a map predicts, as a function of theta."""
+    force = cal.Reaction(scene, "moving", "x").through(forward)
+    assert force is not None  # the pad's motion is a parameter, and the skin rests as it lies
+    return force
 
 
 @dataclass(frozen=True)

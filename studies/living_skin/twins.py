@@ -1,5 +1,9 @@
 """Twins: skins of FEM whose truth is known, inferred with errors that correlate and without."""
 
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +17,7 @@ from calibrate.measurements.full_field import field_data
 from calibrate.statistical_model.errors import with_described_errors
 from emulator.core.errors import SolverError
 from emulator.scenes import Scene
+from emulator.scenes.tissue import stiffness_of
 from emulator.surrogates.protocol import ForwardMap
 
 SIZE = 0.05  # mm, of the twins' errors that correlate
@@ -84,6 +89,81 @@ def _inside(model: cal.Model, data: dict[str, np.ndarray], truth: dict[str, floa
             low, high = (float(x) for x in np.quantile(values, (0.05, 0.95)))
             rows[name] = {"low": low, "high": high, "inside": bool(low <= truth[name] <= high)}
     return rows
+
+
+def stiffness_logs(found: cal.Posterior, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Middles (m, 2) mm of the region's elements, and draws (s, m) of the log of mu s in kPa."""
+    thetas = found.thetas(found.model.states.states[0])
+    thetas = thetas[np.linspace(0, len(thetas) - 1, 150).astype(int)]
+    first = next(name for name in scene.parameter_names if name in scene.law.shape_moduli)
+    inside = np.flatnonzero(scene.regions == 1)
+    middles = scene.mesh.nodes[scene.mesh.corners].mean(axis=1)[inside, :2]
+
+    @jax.jit
+    def logs(theta: jax.Array) -> jax.Array:
+        values = scene.resolve(theta)
+        stiffness = stiffness_of(scene.regions, scene.stiffness_modes, values)
+        assert stiffness is not None
+        return jnp.log(stiffness[inside] * values[first])
+
+    return middles, np.asarray(jax.vmap(logs)(thetas))
+
+
+def inclusion_twin(
+    scene: Scene, forward: ForwardMap, model_of: Callable[..., Any], measured: Measured,
+    frames: tuple[str, ...], number: int,
+) -> Case:  # fmt: skip
+    """A scar with a round stiff inclusion, of which the model with modes of stiffness is not told.
+
+    scene, forward : those of the scar with modes. model_of : the study's own model of frames.
+    """
+    rng, key = np.random.default_rng(1000 + number), jax.random.key(1000 + number)
+    scar = np.flatnonzero(scene.regions == 1)
+    middles = scene.mesh.nodes[scene.mesh.corners].mean(axis=1)[:, :2]
+    candidates = middles[scar][(middles[scar, 0] > 3.0) & (middles[scar, 0] < 35.0)]
+    centre, radius = rng.choice(candidates), rng.uniform(4.0, 7.0)
+    stiff = np.linalg.norm(middles - centre, axis=1) < radius
+    regions = np.where(stiff & (scene.regions == 1), 2, scene.regions)
+    factor, mu = float(rng.uniform(3.0, 6.0)), float(rng.uniform(2.0, 5.0))
+    ranges = {parameter.name: parameter for parameter in scene.parameters}
+    around = replace(ranges["stiffness_1"], name="stiffness_2", high=100.0)
+    kept = tuple(each for each in scene.parameters if "mode" not in each.name)
+    exact = replace(
+        scene, regions=regions, stiffness_modes=None, parameters=(*kept, around), origin={}
+    )
+    truth = {"mu": mu, "foundation": 0.003, "prestress": 5.0, "stiffness_1": 4.0}
+    simulator, fields = em.Simulator(exact), []
+    for frame in frames:
+        theta = exact.theta(**truth, stiffness_2=4.0 * factor, pull=measured.amounts[frame])
+        fields.append(simulator.solve(theta).require_converged().displacement)
+    model, _ = model_of(scene, forward, measured, frames, known_size=SIZE)
+    u = jnp.stack(fields)[:, model.observe.nodes]
+    draw = {name: jnp.asarray(0.0) for name in model.names}
+    draw |= {name: jnp.asarray(value) for name, value in truth.items()}
+    means = model.fem_means(key, draw, model.observe(u, model.states.thetas(draw)))
+    data = {
+        name: np.asarray(mean) + model.noise[name].simulate(rng, np.shape(mean))
+        for name, mean in means.items()
+    }
+    told, _ = model_of(scene, forward, measured, frames)
+    options = cal.LaplaceOptions(draws=300, starts=2)
+    found = cal.sample(told, data, sampler="laplace", options=options, seed=1, predictions=False)
+    places, logs = stiffness_logs(found, scene)
+    real = np.log(mu * np.where(stiff[scar], 4.0 * factor, 4.0))
+    low, high = np.quantile(logs, (0.05, 0.95), axis=0)
+    inside = (real >= low) & (real <= high)
+    return {
+        "centre_mm": centre.tolist(),
+        "radius_mm": float(radius),
+        "factor": factor,
+        "elements": len(scar),
+        "inside": float(np.mean(inside)),
+        "inside_inclusion": float(np.mean(inside[stiff[scar]])),
+        "middles_mm": places.round(2).tolist(),
+        "truth_log_kpa": real.round(3).tolist(),
+        "mean_log_kpa": logs.mean(axis=0).round(3).tolist(),
+        "sd": logs.std(axis=0).round(3).tolist(),
+    }
 
 
 def coverage(cases: list[Case]) -> Case:

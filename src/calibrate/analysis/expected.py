@@ -117,12 +117,11 @@ def information_at(model: Model, observe: Observations, noise: Mapping[str, Nois
             problem = f"load state '{state}' is unknown" if state else "no load state is named"
             raise InputError(f"{problem}; known: {', '.join(filter(None, known)) or 'none'}")
     rows = np.array([known.index(state) for state in observe.states])
-    forward = model.full.at(observe.nodes)
+    predicted = observe.through(model.full)
 
     def data(x: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
         thetas = model.states.thetas(dict(zip(names, model.from_scales(x), strict=True)))[rows]
-        u = jnp.stack([forward.evaluate(theta).displacement for theta in thetas])
-        means = observe(u, thetas)
+        means, _ = predicted(thetas)
         return ravel_pytree(means)[0], means
 
     def at(x: jax.Array, error: ModelError | None, sizes: jax.Array) -> jax.Array:

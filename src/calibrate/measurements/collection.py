@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -17,6 +17,9 @@ from scipy.sparse import csr_array, eye_array, vstack
 from calibrate.measurements.observation import Observation
 from calibrate.state_names import split, states_of
 from emulator.core.errors import InputError
+from emulator.surrogates.protocol import ForwardMap, Prediction
+
+Data = dict[str, jax.Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,12 +137,59 @@ class Observations:
             blocks.append(csr_array(eye_array(columns.size, format="csr")[seen]))
         return Decoding(csr_array(vstack(blocks)), rows, rest)
 
-    def decoded(self, values: jax.Array, thetas: jax.Array) -> dict[str, jax.Array]:
-        """Return the data of each part without noise from what :attr:`decoding` asks for.
+    def through(self, forward: ForwardMap) -> Callable[[jax.Array], tuple[Data, jax.Array]]:
+        """Return a function of theta in every load state, (S, p): the data, and its validity ().
 
-        values : the product (S, r) of its matrix and the displacements in every load state.
-        thetas : theta in every load state, (S, p).
+        The data of each part are without noise, and 0 where not valid.
+
+        forward : the map of all nodes.
         """
+        own: dict[Observation, Callable[[jax.Array], jax.Array]] = {}
+        for part in dict.fromkeys(self.parts.values()):
+            if (told := part.through(forward)) is not None:
+                own[part] = told
+        rest = {name: part for name, part in self.parts.items() if part not in own}
+        others = Observations(rest) if rest else None
+        seen = others._seen(forward.at(others.nodes)) if others is not None else None
+        if seen is not None and not own:
+            return seen
+        states = () if others is None else others.states
+        rows = np.array([self.states.index(state) for state in states], dtype=int)
+
+        def data(thetas: jax.Array) -> tuple[Data, jax.Array]:
+            found, valid = ({}, jnp.array(True)) if seen is None else seen(thetas[rows])
+            for part, told in own.items():
+                names = [name for name, each in self.parts.items() if each is part]
+                own_rows = np.array([self.states.index(split(name)[1]) for name in names])
+                valid &= jnp.all(forward.scene.space.contains(thetas[own_rows]))
+                values = jax.vmap(told)(thetas[own_rows])
+                found |= dict(zip(names, jnp.where(valid, values, 0.0), strict=True))
+            return {name: found[name] for name in self.parts}, valid
+
+        return data
+
+    def _seen(self, forward: ForwardMap) -> Callable[[jax.Array], tuple[Data, jax.Array]]:
+        """Return the function of :meth:`through` by the displacement of ``nodes``."""
+        seen_through = getattr(forward, "seen_through", None)
+        decode = None if seen_through is None else seen_through(self.decoding.matrix)
+        if decode is None:
+            return partial(self._by_displacement, forward)
+        return partial(self._decoded, decode)
+
+    def _by_displacement(self, forward: ForwardMap, thetas: jax.Array) -> tuple[Data, jax.Array]:
+        displacement, valid = in_every_state(forward, thetas)
+        return self(jnp.where(valid, displacement, 0.0), thetas), valid
+
+    def _decoded(
+        self, decode: Callable[[jax.Array], tuple[jax.Array, jax.Array]], thetas: jax.Array
+    ) -> tuple[Data, jax.Array]:
+        """Return the function of :meth:`through` by what :attr:`decoding` asks for.
+
+        decode : the function of theta (p,) to its matrix's product (r,) with the displacement.
+        """
+        values, valid = jax.vmap(decode)(thetas)
+        valid = jnp.all(valid)
+        values = jnp.where(valid, values, 0.0)
         _, rows, rest = self.decoding
         data: dict[str, jax.Array] = {}
         for name, own in rows.items():
@@ -151,7 +201,7 @@ class Observations:
             states = np.array([self.states.index(state) for state in rest.states])
             u = values[states, values.shape[1] - 3 * len(rest.nodes) :]
             data |= rest(u.reshape(len(states), -1, 3), thetas[states])
-        return {name: data[name] for name in self.parts}
+        return {name: data[name] for name in self.parts}, valid
 
     def gripped(self, shares: np.ndarray) -> Observations:
         """Return the same observations of a gripped specimen, see :meth:`Observation.gripped`."""
@@ -207,6 +257,15 @@ class Decoding(NamedTuple):
     matrix: csr_array
     rows: Mapping[str, np.ndarray]
     others: Observations | None
+
+
+def in_every_state(forward: ForwardMap, thetas: jax.Array) -> Prediction:
+    """Return the displacement (S, k, 3) mm at ``thetas`` (S, p), valid where all are."""
+    if len(thetas) == 1:
+        displacement, valid = forward.evaluate(thetas[0])
+        return Prediction(displacement[None], valid)
+    displacement, valid = jax.vmap(forward.evaluate)(thetas)
+    return Prediction(displacement, jnp.all(valid))
 
 
 def observations(observe: Observation | Mapping[str, Observation] | Observations) -> Observations:

@@ -15,7 +15,7 @@ supposes that whether a value is missing does not depend on the value.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -27,6 +27,7 @@ from calibrate.noise.gaussian import GaussianNoise
 from calibrate.noise.protocol import Sites
 from emulator.core.errors import InputError
 from emulator.scenes.scene import Scene
+from emulator.surrogates.protocol import ForwardMap
 
 LARGEST_SHARE = 0.03
 """Largest default sd of noise as a share of the body's size, or of the cavity's volume."""
@@ -251,6 +252,14 @@ class Observation(ABC):
     def __call__(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the data without noise (..., *shape), from one load state; see ``evaluate``."""
         return self.evaluate(displacement, theta)
+
+    def through(self, forward: ForwardMap) -> Callable[[jax.Array], jax.Array] | None:
+        """Return the data without noise, (*shape), as a function of theta (p,), or None.
+
+        Of a forward map that tells this observation better than its displacement does, which is
+        only nearly in equilibrium; of others it is None.
+        """
+        return None
 
     def gripped(self, shares: np.ndarray) -> Self:
         """Return the observation with what the grips of a specimen add to its stresses.

@@ -57,6 +57,8 @@ class Outputs:
         nodes = forward.nodes if field or observe is None else observe.nodes
         self.nodes, self._map = nodes, forward.at(nodes)
         self._observe, self._field, self._what = observe, field, what
+        solves = isinstance(forward, FEMForward)
+        self._through = None if observe is None or solves else observe.through(forward)
         position = {int(node): k for k, node in enumerate(nodes)}
         seen = () if observe is None else observe.nodes.tolist()
         self._rows = np.array([position[node] for node in seen], dtype=int)
@@ -71,7 +73,10 @@ class Outputs:
         """Return the numbers (m,) for the displacement ``u`` (k, 3) mm at ``theta`` (p,)."""
         numbers: list[jax.Array] = []
         if self._observe is not None:
-            seen = self._observe(u[None, self._rows], theta[None])
+            if self._through is None:
+                seen = self._observe(u[None, self._rows], theta[None])
+            else:
+                seen, _ = self._through(theta[None])
             numbers += [jnp.ravel(each) for each in seen.values()]
         if self._field:
             square = jnp.sum(u**2, axis=-1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import jax
@@ -11,6 +12,7 @@ from emulator.core.errors import InputError
 from emulator.fem.reactions import SupportForce
 from emulator.scenes.loads.force import MN_PER_N
 from emulator.scenes.scene import Scene
+from emulator.surrogates.protocol import ForwardMap
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
@@ -51,6 +53,12 @@ class Reaction(Scalar):
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the force (...) in N."""
         return self.force(displacement, theta) / MN_PER_N
+
+    def through(self, forward: ForwardMap) -> Callable[[jax.Array], jax.Array] | None:
+        """Return the force () in N by the work of the whole body, of an emulator of the scene."""
+        by_work = getattr(forward, "support_force", None)
+        force = None if by_work is None else by_work(self.force)
+        return None if force is None else lambda theta: force(theta) / MN_PER_N
 
 
 def _direction(text: str) -> tuple[float, float, float]:

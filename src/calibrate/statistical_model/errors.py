@@ -215,14 +215,15 @@ def map_errors(
     if simulator.scene.loaded_by:
         return {}  # its equations are of two displacements: at rest, and from there to the mesh
     step = compiled(partial(newton_distance, simulator.system))
-    observe, predict = model.observe, jax.jit(model.full)
+    observe, predict, means = model.observe, jax.jit(model.full), jax.jit(model.means)
     states, count = len(model.states.states), len(next(iter(draws.values())))
     errors = []
     for row in np.linspace(0, count - 1, max(_STEPS // states, 1) + 2)[1:-1].astype(int):
         thetas = model.states.thetas({name: values[row] for name, values in draws.items()})
         u = jnp.stack([predict(theta) for theta in thetas])
         off = jnp.stack([step(each, theta).error for each, theta in zip(u, thetas, strict=True)])
-        seen = (observe(each[:, observe.nodes], thetas) for each in (u, u - off))
+        exact = observe((u - off)[:, observe.nodes], thetas)
+        seen = means(thetas)[0], exact
         error = jnp.subtract(*(ravel_pytree(each)[0] for each in seen))
         errors += [error] if bool(jnp.all(jnp.isfinite(error))) else []
     return in_noise_sd(model, np.array(errors), draws)

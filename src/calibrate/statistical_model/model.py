@@ -27,6 +27,7 @@ from numpyro import handlers
 
 from calibrate import mend_numpyro
 from calibrate.measurements import Observation, Observations, leave_out_missing, observations
+from calibrate.measurements.collection import in_every_state
 from calibrate.measurements.magnitude import PRIOR_DRAWS, check_magnitudes, predict_over_prior
 from calibrate.model_error import ModelError
 from calibrate.noise import Noise
@@ -211,29 +212,19 @@ class Model:
         thetas : theta in every load state, (S, p).
         prediction : the result of :meth:`evaluate` there, where it is known already.
         """
-        if prediction is None and self._decoded is not None:
-            values, valid = jax.vmap(self._decoded)(thetas)
-            valid = jnp.all(valid)
-            return self.observe.decoded(jnp.where(valid, values, 0.0), thetas), valid
-        displacement, valid = self.evaluate(thetas) if prediction is None else prediction
+        if prediction is None:
+            return self._through(thetas)
+        displacement, valid = prediction
         return self.observe(jnp.where(valid, displacement, 0.0), thetas), valid
 
     @cached_property
-    def _decoded(self) -> Callable[[jax.Array], tuple[jax.Array, jax.Array]] | None:
-        """The function of theta (p,) by which the observations are decoded at once, or None."""
-        seen_through = getattr(self.forward, "seen_through", None)
-        return None if seen_through is None else seen_through(self.observe.decoding.matrix)
+    def _through(self) -> Callable[[jax.Array], tuple[dict[str, jax.Array], jax.Array]]:
+        """The data that the map predicts, as a function of theta in every load state."""
+        return self.observe.through(self.full)
 
     def evaluate(self, thetas: jax.Array) -> Prediction:
-        """Return the displacement (S, k, 3) mm of the observed nodes at ``thetas`` (S, p).
-
-        It is one call of the forward map, valid where the map is valid in every state.
-        """
-        if len(thetas) == 1:
-            displacement, valid = self.forward.evaluate(thetas[0])
-            return Prediction(displacement[None], valid)
-        displacement, valid = jax.vmap(self.forward.evaluate)(thetas)
-        return Prediction(displacement, jnp.all(valid))
+        """Return the displacement (S, k, 3) mm of the observed nodes at ``thetas`` (S, p)."""
+        return in_every_state(self.forward, thetas)
 
     def predict(self, values: Mapping[str, Any]) -> tuple[dict[str, jax.Array], jax.Array]:
         """Return data without noise by observation, and its validity, from each unknown's value."""

@@ -186,6 +186,18 @@ def energy_of_gradient(
     return jnp.sum(scene.blocks.weights * values)
 
 
+def block_energies(scene: Scene, theta: jax.Array, H: jax.Array, rows: np.ndarray) -> jax.Array:
+    """Return the strain energy (k,) in mN mm of the blocks ``rows`` (k,).
+
+    H : the displacement gradient (k, q, 3, 3) at their points.
+    """
+    weights = scene.blocks.weights[rows]
+    tissue = jax.tree.map(lambda array: array[rows], scene.block_tissue_at(theta))
+    if scene.dilatation != "pointwise":
+        H = jax.vmap(with_mean_dilatation)(H, jnp.asarray(weights))
+    return jnp.sum(weights * at_points(point_energy(scene, theta), H, tissue), axis=1)
+
+
 def law_gradients(scene: Scene, u: jax.Array) -> jax.Array:
     """Return the displacement gradients (b, q, 3, 3) that the law sees at ``u`` (n, 3) mm."""
     return _seen_by_law(scene, displacement_gradient(scene, u))

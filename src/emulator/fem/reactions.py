@@ -12,14 +12,14 @@ so the sum of all R is minus the resultant of the loads.
 The resultant of one support along the unit vector d follows from the virtual displacement
 :math:`\varphi` that moves the support's nodes by d and no others,
 
-.. math:: R \cdot d = \Pi_\text{elastic}'(u)[\varphi] - f_\text{ext} \cdot \varphi
-          \;\text{(prescribed)}, \qquad
+.. math:: R \cdot d = \Pi_\text{elastic}'(u)[\varphi] + \Pi_s'(u)[\varphi]
+          - f_\text{ext} \cdot \varphi \;\text{(prescribed)}, \qquad
           R \cdot d = -\Pi_s'(u)[\varphi] \;\text{(springs)},
 
-in mN. Only elements (or patches of them), springs and loads at these nodes enter
-(:class:`SupportForce`). It is the derivative of the least potential energy by the support's own
-displacement along d, because the energy at equilibrium does not change with the free displacements
-(envelope theorem).
+in mN. Springs of another support at prescribed nodes are not part of it. Only elements (or patches
+of them), springs and loads at these nodes enter (:class:`SupportForce`). It is the derivative of
+the least potential energy by the support's own displacement along d, because the energy at
+equilibrium does not change with the free displacements (envelope theorem).
 """
 
 from __future__ import annotations
@@ -37,15 +37,13 @@ from emulator.fem.assembly import System
 from emulator.fem.compiled import compiled
 from emulator.fem.energy import (
     DeadForce,
-    at_points,
+    block_energies,
     dead_force,
     force_on_body,
     local_forces,
     local_terms,
-    point_energy,
     spring_terms,
     strain_energy,
-    with_mean_dilatation,
 )
 from emulator.geometry.mesh import Mesh
 from emulator.scenes.part import LocalForce, LocalTerm
@@ -133,6 +131,11 @@ class SupportForce:
                 f"force of support '{self.name}': nothing is held along {self.direction} there"
             )
 
+    @property
+    def support_nodes(self) -> np.ndarray:
+        """The nodes (k,) of the support."""
+        return nodes_of(self.scene.mesh, self.name)
+
     @cached_property
     def _balanced(self) -> Scene:
         return balanced(self.scene)
@@ -141,7 +144,7 @@ class SupportForce:
     def _virtual(self) -> tuple[np.ndarray, np.ndarray]:
         """The virtual displacement (n, 3) at prescribed displacements, and at springs."""
         held, virtual = self.scene.held, np.zeros(self.scene.held.shape)
-        virtual[nodes_of(self.scene.mesh, self.name)] = self.direction
+        virtual[self.support_nodes] = self.direction
         sprung = np.zeros((len(virtual), 1), dtype=bool)
         for spring in spring_terms(self.scene):
             sprung[spring.nodes] = True
@@ -155,10 +158,11 @@ class SupportForce:
 
     @cached_property
     def _parts(self) -> tuple[list[LocalTerm | LocalForce], list[LocalTerm]]:
-        """Loads that follow the deformation where prescribed, and springs where free."""
+        """Loads that follow the deformation, and springs, at the support's nodes."""
         scene, (prescribed, sprung) = self._balanced, self._virtual
         loads: list[LocalTerm | LocalForce] = [*local_terms(scene), *local_forces(scene)]
-        return _contributions_at(loads, prescribed), _contributions_at(spring_terms(scene), sprung)
+        springs = _contributions_at(spring_terms(scene), prescribed + sprung)
+        return _contributions_at(loads, prescribed), springs
 
     @cached_property
     def nodes(self) -> np.ndarray:
@@ -184,14 +188,10 @@ class SupportForce:
         number[self.nodes] = np.arange(len(self.nodes))
         prescribed, sprung = (jnp.asarray(virtual[self.nodes]) for virtual in self._virtual)
         connectivity = number[scene.blocks.connectivity[adjacent]]
-        gradients, weights = scene.blocks.gradients[adjacent], scene.blocks.weights[adjacent]
-        tissue = jax.tree.map(lambda array: array[adjacent], scene.block_tissue_at(theta))
 
         def strain_energy_at_support(v: jax.Array) -> jax.Array:
-            H = jnp.einsum("bai,bqaj->bqij", v[connectivity], gradients)
-            if scene.dilatation != "pointwise":
-                H = jax.vmap(with_mean_dilatation)(H, jnp.asarray(weights))
-            return jnp.sum(weights * at_points(point_energy(scene, theta), H, tissue))
+            H = jnp.einsum("bai,bqaj->bqij", v[connectivity], scene.blocks.gradients[adjacent])
+            return jnp.sum(block_energies(scene, theta, H, adjacent))
 
         def force_of(parts: Sequence[LocalTerm | LocalForce]) -> jax.Array:
             local = (replace(part, nodes=number[part.nodes]) for part in parts)
@@ -199,8 +199,8 @@ class SupportForce:
 
         loads, springs = self._parts
         bulk = jax.jvp(strain_energy_at_support, (u,), (prescribed,))[1]
-        external = force_of(loads) + self._dead.total(values)
-        return bulk - jnp.vdot(external, prescribed) + jnp.vdot(force_of(springs), sprung)
+        others = force_of(loads) + self._dead.total(values) + (by_springs := force_of(springs))
+        return bulk - jnp.vdot(others, prescribed) + jnp.vdot(by_springs, sprung)
 
 
 def support_forces(scene: Scene) -> dict[str, SupportForce]:

@@ -56,9 +56,13 @@ class LocalTerm(LocalSum):
     energy: Callable[[jax.Array, Any, Values], jax.Array]
     convex: bool = False
 
+    def energies(self, u: jax.Array, values: Values) -> jax.Array:
+        """Return the energy (k,) in mN mm of each group."""
+        return self._each(self.energy, u, values)
+
     def total(self, u: jax.Array, values: Values) -> jax.Array:
         """Return the sum, shape ()."""
-        return jnp.sum(self._each(self.energy, u, values))
+        return jnp.sum(self.energies(u, values))
 
     def tangents(self, u: jax.Array, values: Values) -> jax.Array:
         """Return the Hessians (k, 3a, 3a) of the local energies."""
@@ -176,6 +180,15 @@ class Load(Part):
 
     def check(self, mesh: Mesh, prescribed: Prescribed) -> None:
         """Raise :class:`~emulator.core.errors.InputError` if the load cannot act on this body."""
+
+    @property
+    def energy_density(self) -> Callable[[jax.Array, Values], jax.Array] | None:
+        """The energy (...) in kPa at a displacement gradient (..., 3, 3), or None.
+
+        Only of a load under which bodies at rest are in equilibrium, if they are held where it asks
+        for it. What is linear in the gradient, and then adds up to nothing, is left out.
+        """
+        return None
 
     def dead_forces(self, grid: Discretisation) -> Mapping[str | None, np.ndarray]:
         """Return nodal forces (n, 3) that do not follow the deformation.

@@ -32,6 +32,7 @@ from emulator.catalogue import scene_from_origin
 from emulator.core.display import TableRepr
 from emulator.core.errors import InputError, look_up
 from emulator.core.store import inside, read_arrays, read_json, save_arrays, write_json
+from emulator.fem.reactions import SupportForce
 from emulator.scenes.scene import Scene, all_nodes, check_nodes
 from emulator.surrogates.coarse import Coarse
 from emulator.surrogates.discrepancy import Discrepancy
@@ -49,6 +50,7 @@ from emulator.surrogates.protocol import (
     inside_only,
     rows_of,
 )
+from emulator.surrogates.support_work import SupportWork, amount_of
 from emulator.surrogates.taylor import Expansion
 
 FORMAT = 3
@@ -135,6 +137,22 @@ class Emulator(TableRepr):
         cached = [part.cache(nodes) for part in self.parts.values()]
         return CachedEmulator(self, together(cached, len(nodes)), nodes)
 
+    @cached_property
+    def _works(self) -> dict[tuple[str, tuple[float, float, float]], SupportWork | None]:
+        """The works of supports that were asked for, by name and direction."""
+        return {}
+
+    def work_of(self, force: SupportForce) -> SupportWork | None:
+        """Return the force of a support from the work of the whole body; None where it is not."""
+        key = force.name, force.direction
+        if key not in self._works:
+            amount = amount_of(force)
+            with jax.ensure_compile_time_eval():  # a caller may be traced
+                self._works[key] = (
+                    None if amount is None else SupportWork(self.cache(), force, amount)
+                )
+        return self._works[key]
+
 
 @dataclass(frozen=True, eq=False)
 class CachedEmulator:
@@ -208,6 +226,17 @@ class CachedEmulator:
             return found + sum(at[name] * each for name, each in prescribed.items()), inside
 
         return values
+
+    def support_force(self, force: SupportForce) -> Callable[[jax.Array], jax.Array] | None:
+        """Return ``force`` in mN as a function of theta (p,), from the work of the whole body.
+
+        Outside the box it is the force at the centre. None where no parameter moves the support
+        along the force (:mod:`emulator.surrogates.support_work`).
+        """
+        if (work := self.emulator.work_of(force)) is None:
+            return None
+        scene = self.scene
+        return lambda theta: work(jnp.where(scene.space.contains(theta), theta, scene.centre))
 
     def at(self, nodes: np.ndarray) -> CachedEmulator:
         """Return the same map over ``nodes``, which must be among those cached."""

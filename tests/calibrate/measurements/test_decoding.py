@@ -34,7 +34,7 @@ def observed(scene):
     kinds = {
         "displacement": cal.landmarks(scene, inside),
         "surface:right": cal.surface_points(scene, "right", outside),
-        "reaction:top:x": cal.Reaction(scene, "top", "x"),
+        "reaction:bottom:x": cal.Reaction(scene, "bottom", "x"),
     }
     parts = {f"{name}@{s}": part for name, part in kinds.items() for s in STATES}
     nodes = cal.nodal_displacements(scene, np.unique([*top.tolist(), 20, 21, 30, 31])[:5])
@@ -70,7 +70,7 @@ def test_data_and_slopes_are_those_by_way_of_the_nodes(model):
 
 def test_only_what_is_seen_is_decoded(model):
     matrix, rows, others = model.observe.decoding
-    assert set(others.parts) == {f"reaction:top:x@{s}" for s in STATES}
+    assert set(others.parts) == {f"reaction:bottom:x@{s}" for s in STATES}
     linear = 10 + 15 + 4  # in-plane points, nodes, and the surface, each once for all states
     assert matrix.shape[0] == linear + 3 * len(others.nodes)
     assert len(rows) == 6

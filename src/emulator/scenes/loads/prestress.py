@@ -17,10 +17,12 @@ convex, and tension stiffens the sheet against being sheared or pushed out of it
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, override
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.errors import InputError
@@ -63,6 +65,17 @@ class Prestress(Load):
     def simpler(self) -> tuple[str, None]:
         """A sheet without tension."""
         return "prestress", None
+
+    @property
+    @override
+    def energy_density(self) -> Callable[[jax.Array, Values], jax.Array]:
+        """Half the tension times the squares of the gradient's columns in the plane."""
+
+        def density(H: jax.Array, values: Values) -> jax.Array:
+            within = jnp.sum(H**2, axis=-2) @ np.diag(self._unit_stress)
+            return 0.5 * self.value(values) * within
+
+        return density
 
     @override
     def first_piola(
