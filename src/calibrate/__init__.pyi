@@ -63,7 +63,7 @@ from .samplers import (
     density_of,
 )
 from .statistical_model import Model
-from .statistical_model.errors import with_systematic
+from .statistical_model.errors import with_described_errors, with_systematic
 from .statistical_model.model import model
 from .um_bridge import serve
 
@@ -150,6 +150,7 @@ __all__ = [
     "surface_points",
     "truncated",
     "truncated_normal",
+    "with_described_errors",
     "with_systematic",
     "write_report",
 ]

@@ -72,17 +72,18 @@ def twins_of(
         }
         return {
             "truth": truth,
-            "correlated": _inside(told, data, truth),
-            "independent": _inside(independent, data, truth),
+            "correlated": _inside(told, data, truth, "auto"),
+            "independent": _inside(independent, data, truth, "laplace"),
         }
 
     return [results.case(f"twin {k}", lambda k=k: twin(k)) for k in range(count)]
 
 
-def _inside(model: cal.Model, data: dict[str, np.ndarray], truth: dict[str, float]) -> Case:
-    # A hundred thousand forces, as importance sampling asks for, would take four minutes a twin.
-    options = cal.LaplaceOptions(draws=300, starts=2)
-    found = cal.sample(model, data, sampler="laplace", options=options, seed=1, predictions=False)
+def _inside(
+    model: cal.Model, data: dict[str, np.ndarray], truth: dict[str, float], sampler: str
+) -> Case:
+    options = cal.LaplaceOptions(draws=300, starts=2) if sampler == "laplace" else None
+    found = cal.sample(model, data, sampler=sampler, options=options, seed=1, predictions=False)
     rows = {}
     for name, values in found.draws().items():
         if name in truth:

@@ -28,6 +28,7 @@ from emulator.core.errors import InputError
 from emulator.core.store import read_json, replacing
 from emulator.scenes.specimen import is_specimen
 
+_SHEET = 0.1  # thickness of a sheet, as a share of its width
 _SHIFTS = {
     "FEM": "by FEM / sd",
     "mesh": "on a finer mesh / sd",
@@ -81,7 +82,7 @@ def html_of(
         ("Data against prediction", data or [parts.note("The run kept no predictions.")]),
         ("Parameters", _parameters(run, posterior, certificate, labels)),
         *body,
-        ("What the data determine", [*_known(posterior), *_terms(posterior)]),
+        ("What the data determine", [*_known(posterior), *_sheet(posterior), *_terms(posterior)]),
         ("Draws", [parts.chart(figure) for figure in draws]),
         ("Where this comes from, and how to repeat it", _provenance(run, posterior)),
     ]
@@ -161,6 +162,26 @@ def _known(posterior: Posterior) -> list[Markup]:
         head = ("load state", "cavity volume (mL), median and 90 %")
         blocks += [parts.table(head, rows), parts.paragraph(text)]
     return blocks
+
+
+def _sheet(posterior: Posterior) -> list[Markup]:
+    """Return what forces tell of a sheet: its moduli times its thickness, which was assumed."""
+    model, scene = posterior.model, posterior.model.forward.scene
+    thickness, width, _ = np.sort(np.ptp(scene.mesh.nodes, axis=0))
+    forces = any(part.unit == "N" for part in model.observe.parts.values())
+    if not forces or thickness > _SHEET * width:
+        return []
+    draws, moduli = posterior.draws(), (*scene.law.shape_moduli, "prestress")
+    told = [name for name in moduli if name in draws]
+    rows = [
+        (name, parts.median_and_range(thickness * np.ravel(draws[name]), ".3g")) for name in told
+    ]
+    text = (
+        f"The body is a sheet, {thickness:.3g} mm thick. Forces on a sheet are in proportion to "
+        "moduli times thickness, so moduli err as the thickness does. Of the product they tell:"
+    )
+    head = ("modulus", "times the thickness (N/m), median and 90 %")
+    return [parts.paragraph(text), parts.table(head, rows)] if told else []
 
 
 def _terms(posterior: Posterior) -> list[Markup]:

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -186,16 +187,30 @@ def energy_of_gradient(
     return jnp.sum(scene.blocks.weights * values)
 
 
-def block_energies(scene: Scene, theta: jax.Array, H: jax.Array, rows: np.ndarray) -> jax.Array:
-    """Return the strain energy (k,) in mN mm of the blocks ``rows`` (k,).
+def block_energies(
+    scene: Scene, theta: jax.Array, H: jax.Array, rows: np.ndarray, points: np.ndarray | None = None
+) -> jax.Array:
+    """Return the strain energy (k, q) in mN mm of each point of the blocks ``rows`` (k,).
 
     H : the displacement gradient (k, q, 3, 3) at their points.
+    points : the number (k,) of one point of each block, the only one that is evaluated, (k, 1).
     """
     weights = scene.blocks.weights[rows]
     tissue = jax.tree.map(lambda array: array[rows], scene.block_tissue_at(theta))
+    change = None
     if scene.dilatation != "pointwise":
-        H = jax.vmap(with_mean_dilatation)(H, jnp.asarray(weights))
-    return jnp.sum(weights * at_points(point_energy(scene, theta), H, tissue), axis=1)
+        J_minus_1 = at_points(lambda h: Strain(h).J_minus_1, H)
+        change = jnp.sum(weights * J_minus_1, axis=1, keepdims=True) / weights.sum(1, keepdims=True)
+    if points is not None:
+        weights, H, tissue = jax.tree.map(partial(one_of_each, points), (weights, H, tissue))
+    if change is not None:
+        H = at_points(with_volume_change, H, jnp.broadcast_to(change, weights.shape))
+    return weights * at_points(point_energy(scene, theta), H, tissue)
+
+
+def one_of_each[A: (jax.Array, np.ndarray)](points: np.ndarray, field: A) -> A:
+    """Return a ``field`` (k, q, ...) at one point of each block, ``points`` (k,): (k, 1, ...)."""
+    return field[np.arange(len(points)), points][:, None]
 
 
 def law_gradients(scene: Scene, u: jax.Array) -> jax.Array:

@@ -20,9 +20,9 @@ potential energy by the motion. With c the support's displacement for a unit of 
 A body that lies in equilibrium under a tension has a force on the support at rest; the work is that
 of what the motion adds to it.
 
-The work is a sum over elements and springs. A few of them with weights of 0 or more give it, too
-(Farhat et al. 2014, energy-conserving sampling and weighting): non-negative least squares, over a
-few theta, finds at most as many as there are theta.
+The work is a sum over quadrature points and springs. A few of them with weights of 0 or more give
+it, too (Farhat et al. 2014, energy-conserving sampling and weighting): non-negative least squares,
+over a few theta, finds at most as many as there are theta.
 """
 
 from __future__ import annotations
@@ -36,11 +36,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.fem.campaign.designs import sobol
-from emulator.fem.energy import block_energies, force_on_body, local_terms, spring_terms
+from emulator.fem.energy import (
+    block_energies,
+    force_on_body,
+    local_terms,
+    one_of_each,
+    spring_terms,
+)
 from emulator.fem.reactions import SupportForce
 from emulator.scenes.scene import Scene
 
-_PER_PARAMETER = 8  # theta by which elements are weighed, for each parameter
+_PER_PARAMETER = 8  # theta by which points are weighed, for each parameter
 _FEWEST = 48  # theta
 _AT_ONCE = 8  # theta in one batch
 _ROUND_OFF = 1e-9  # of the largest force at a node
@@ -156,7 +162,7 @@ class SupportWork:
         size = np.abs(works).sum(axis=1, keepdims=True)
         works = works[size[:, 0] > 0.0] / size[size[:, 0] > 0.0]
         if not len(works):
-            return every, np.ones(every.count)
+            return every, np.ones(works.shape[1])
         weights, _ = nnls(works, works.sum(axis=1), maxiter=20 * works.shape[1])
         chosen = np.flatnonzero(weights)
         return every.only(chosen), weights[chosen]
@@ -172,56 +178,55 @@ class SupportWork:
 
 @dataclass(frozen=True, eq=False)
 class _Cells:
-    """Blocks of elements and groups of springs of a scene, as few as asked for.
+    """Quadrature points and groups of springs of a scene, as few as asked for.
 
-    forward : the map of their nodes' displacement.
-    blocks : the numbers of the blocks (b,).
-    springs : the numbers (k,) of the springs' groups, by term.
+    forward : the map of the displacement of the nodes that they depend on.
+    points : the numbers (k,) of the points, block after block; None for all.
+    springs : the numbers (g,) of the springs' groups, by term.
     """
 
     scene: Scene
     forward: Displacement
-    blocks: np.ndarray
+    points: np.ndarray | None
     springs: tuple[np.ndarray, ...]
 
     @classmethod
     def of(cls, scene: Scene, forward: Displacement) -> _Cells:
         """Return all of a scene's."""
         springs = tuple(np.arange(len(term.nodes)) for term in spring_terms(scene))
-        return cls(scene, forward, np.arange(len(scene.blocks.weights)), springs)
-
-    @property
-    def count(self) -> int:
-        """The number of blocks and groups."""
-        return len(self.blocks) + sum(len(rows) for rows in self.springs)
+        return cls(scene, forward, None, springs)
 
     def only(self, chosen: np.ndarray) -> _Cells:
-        """Return those of these numbers, ascending, with the map of their nodes alone."""
-        ends = np.cumsum([len(self.blocks), *(len(rows) for rows in self.springs)])
-        blocks, *springs = (part - start for part, start in zip(
-            np.split(chosen, np.searchsorted(chosen, ends))[:-1], (0, *ends[:-1]), strict=True
-        ))  # fmt: skip
-        terms = spring_terms(self.scene)
-        nodes = [self.scene.blocks.connectivity[blocks].ravel()]
-        nodes += [term.nodes[rows].ravel() for term, rows in zip(terms, springs, strict=True)]
+        """Return those of all that have these numbers, ascending, with the map of their nodes."""
+        ends = np.cumsum([self.scene.blocks.weights.size, *(len(rows) for rows in self.springs)])
+        parts = np.split(chosen, np.searchsorted(chosen, ends))[:-1]
+        points, *springs = (part - start for part, start in zip(parts, [0, *ends], strict=False))
+        used = points // self.scene.blocks.weights.shape[1]
+        nodes = [self.scene.blocks.connectivity[used].ravel()]
+        for term, rows in zip(spring_terms(self.scene), springs, strict=True):
+            nodes.append(term.nodes[rows].ravel())
         forward = self.forward.at(np.unique(np.concatenate(nodes)))
-        return _Cells(self.scene, forward, blocks, tuple(springs))
+        return _Cells(self.scene, forward, points, tuple(springs))
 
     def energies(self, u: jax.Array, theta: jax.Array) -> jax.Array:
-        """Return the energy (c,) in mN mm of each at ``u`` (k, 3) mm of the map's nodes."""
+        """Return the energy (c,) in mN mm of each at ``u`` (n, 3) mm of the map's nodes."""
         scene, number = self.scene, np.full(len(self.scene.mesh.nodes), -1)
         number[self.forward.nodes] = np.arange(len(self.forward.nodes))
         blocks, values = scene.blocks, scene.resolve(theta)
-        local = u[number[blocks.connectivity[self.blocks]]]
-        H = jnp.einsum("bai,bqaj->bqij", local, blocks.gradients[self.blocks])
-        elastic = block_energies(scene, theta, H, self.blocks)
+        rows, points = np.arange(len(blocks.weights)), None
+        if self.points is not None:
+            rows, points = np.divmod(self.points, blocks.weights.shape[1])
+        weights, local = blocks.weights[rows], u[number[blocks.connectivity[rows]]]
+        H = jnp.einsum("bai,bqaj->bqij", local, blocks.gradients[rows])
+        elastic = block_energies(scene, theta, H, rows, points)
+        if points is not None:
+            weights, H = one_of_each(points, weights), one_of_each(points, H)
         for load in scene.loads:
             if load.energy_density is not None:
-                density = load.energy_density(H, values)
-                elastic += jnp.sum(blocks.weights[self.blocks] * density, axis=1)
-        energies = [elastic]
-        for term, rows in zip(spring_terms(scene), self.springs, strict=True):
-            data = jax.tree.map(lambda array: array[rows], term.data)  # noqa: B023 - used at once
-            own = replace(term, nodes=number[term.nodes[rows]], data=data)
+                elastic += weights * load.energy_density(H, values)
+        energies = [elastic.ravel()]
+        for term, groups in zip(spring_terms(scene), self.springs, strict=True):
+            data = jax.tree.map(lambda array: array[groups], term.data)  # noqa: B023 - used at once
+            own = replace(term, nodes=number[term.nodes[groups]], data=data)
             energies.append(own.energies(u, values))
         return jnp.concatenate(energies)
