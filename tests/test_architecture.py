@@ -13,7 +13,6 @@ from calibrate.measurements import OBSERVATIONS
 from calibrate.noise import NOISES
 from calibrate.samplers import SAMPLERS
 from emulator.fem.formulations import FORMULATIONS
-from emulator.fem.linear import SOLVERS
 from emulator.mechanics.laws import LAWS
 from emulator.scenes.loads import LOADS
 from emulator.scenes.supports import SUPPORTS
@@ -28,7 +27,6 @@ REGISTRIES = {
     "a noise": NOISES,
     "a sampler": SAMPLERS,
     "a formulation": FORMULATIONS,
-    "a linear solver": SOLVERS,
 }
 
 

@@ -7,8 +7,7 @@ FEM of the ventricle at 5 to 100 thousand nodes, linear and quadratic tetrahedra
 process of its own: time of a solve from rest and of one from a neighbouring solution, iterations,
 factorisations, peak memory, and what a tangent, a factorisation and a back-substitution take.
 Beside them conjugate gradients with a kept factor, and with algebraic multigrid where pyamg is
-installed. One tangent of the linear meshes by PETSc's solvers, where it is installed, and by
-CHOLMOD (``solvers.py``). Then the whole way from a mesh of 50 000 nodes to a certified posterior,
+installed. Then the whole way from a mesh of 50 000 nodes to a certified posterior,
 command by command. Writes results.json after each case and meshes.png.
 """
 
@@ -26,14 +25,13 @@ import scipy.sparse as sp
 from studies.common.output import Case, Results, parser, save
 from studies.common.processes import peak_gb, run
 from studies.common.timing import clocked
-from studies.large_meshes import solvers
 from studies.mesh_to_certificate.__main__ import one as from_mesh_to_certificate
 
 import emulator as em
 from calibrate.figures import pyplot
 from emulator.fem.assembly import System
 from emulator.fem.linear.reuse import KeptFactor
-from emulator.fem.linear.suitesparse import SUITESPARSE
+from emulator.fem.linear.suitesparse import factor_and_solve
 from emulator.fem.solution import Status
 from emulator.scenes.scene import Scene
 
@@ -51,7 +49,6 @@ MESHES = (
     (2, 34, 68, 6),
 )
 QUICK = ((1, 6, 12, 2), (2, 4, 8, 1))
-DIRECT = MESHES[1:4]  # solved by other libraries, too
 POSTERIOR = (52, 104, 10)
 LIMIT = 16.0  # GB that the largest linear mesh may take
 
@@ -105,13 +102,13 @@ def parts(definite: System, u: jax.Array, theta: jax.Array) -> dict[str, Any]:
     definite.safe_tangent(u, theta, 1.0)
     tangent, (K, _) = clocked(lambda: definite.safe_tangent(u, 1.01 * theta, 1.0))
     b = jnp.asarray(np.random.default_rng(SEED).normal(size=definite.pattern.size))
-    solve = jax.jit(partial(SUITESPARSE.solve, definite.pattern, kind="definite"))
+    solve = jax.jit(partial(factor_and_solve, definite.pattern, kind="definite"))
     jax.block_until_ready(solve(K, b))
     other, _ = definite.safe_tangent(u, 1.02 * theta, 1.0)
     both, _ = clocked(lambda: solve(other, b))
     twice = jax.block_until_ready(2.0 * b)
     back, _ = clocked(lambda: solve(other, twice))
-    beside = KeptFactor(SUITESPARSE, definite.pattern)
+    beside = KeptFactor(definite.pattern)
     beside.attempt(K, b)
     beside.attempt(other, b)
     factors = beside.factorisations
@@ -234,8 +231,6 @@ def main() -> None:
     results = Results(given.out, SEED, again=given.again, settings={"quick": given.quick})
     for mesh in QUICK if given.quick else MESHES:
         results.case(f"P{mesh[0]} {mesh[1:]}", lambda mesh=mesh: measured(mesh))
-    for mesh in QUICK[:1] if given.quick else DIRECT:
-        solvers.measure(results, f"P{mesh[0]} {mesh[1:]}", partial(ventricle, *mesh))
     if not given.quick:
         results.case("posterior", lambda: from_mesh_to_certificate("human", POSTERIOR))
     meshes = [case for case in results.cases if "from_rest" in case]

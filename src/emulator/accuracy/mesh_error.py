@@ -229,4 +229,4 @@ def mesh_error(simulator: Simulator | Scene, *, most: int = LARGEST) -> MeshErro
             f"more than {most}; allow more with 'most', or check a coarser mesh of the same body"
         )
     options = replace(coarse.options, tolerance=max(coarse.options.tolerance, _TOLERANCE))
-    return MeshError(coarse, refined, Simulator(refined.scene, options, coarse.factorisation))
+    return MeshError(coarse, refined, Simulator(refined.scene, options))

@@ -48,10 +48,8 @@ from emulator.fem.energy import (
     volume_ratio,
 )
 from emulator.fem.linear import (
-    Direct,
     Pattern,
     block_pattern,
-    find_solver,
     upper_blocks,
     whole_blocks,
 )
@@ -82,21 +80,14 @@ class System:
     """The discrete equations of a scene; vectors of free displacements have shape (f,).
 
     scene : the scene, at rest on its mesh.
-    factorisation : the name of the linear solver in :data:`emulator.fem.linear.SOLVERS`.
     """
 
     scene: Scene
-    factorisation: str = "suitesparse"
 
     inverse: ClassVar[bool] = False  # whether the mesh is loaded and its stress-free shape unknown
 
     def __post_init__(self) -> None:
         require_rest(self.scene)
-
-    @property
-    def direct(self) -> Direct:
-        """The direct solver of linear systems with the tangent."""
-        return find_solver(self.factorisation)
 
     @cached_property
     def programs(self) -> dict[Any, Callable[..., Any]]:
@@ -366,7 +357,7 @@ class System:
 
     def solve(self, tangent: jax.Array, rhs: jax.Array) -> jax.Array:
         """Return ``x`` (f,) with ``K x = rhs`` for any nonsingular K; NaN where K is singular."""
-        return self._by_direct(solve)(tangent, rhs)
+        return self._compiled(solve)(tangent, rhs)
 
     def attempt(
         self, tangent: jax.Array, rhs: jax.Array, *, may_reuse: bool = True
@@ -379,25 +370,21 @@ class System:
         """
         if self.kept is not None and not is_traced(tangent, rhs):
             return self.kept.attempt(tangent, rhs, may_reuse=may_reuse)
-        return self._by_direct(attempt)(tangent, rhs)
+        return self._compiled(attempt)(tangent, rhs)
 
-    def _by_direct(self, how: Callable[..., Any]) -> Callable[..., Any]:
-        """Return ``how`` of the direct solver, compiled unless Python calls the solver."""
+    def _compiled(self, how: Callable[..., Any]) -> Callable[..., Any]:
+        """Return ``how`` with the tangent's pattern, compiled once."""
         if how not in self.programs:
-            program = partial(how, self.direct, self.pattern)
-            self.programs[how] = program if self.direct.on_host else compiled(program)
+            self.programs[how] = compiled(partial(how, self.pattern))
         return self.programs[how]
 
     @property
     def stepwise(self) -> bool:
-        """Whether solves from Python take one compiled step after the other.
-
-        Kept factors, and solvers on the host, are reached only from Python.
-        """
-        return self.direct.on_host or self.kept is not None
+        """Whether solves from Python go step by step, as a kept factor asks."""
+        return self.kept is not None
 
     @cached_property
     def kept(self) -> KeptFactor | None:
         """The factor that serves several tangents; None where factorising is cheap."""
         pays = self.scene.dilatation == "pointwise" and KeptFactor.pays(self.pattern)
-        return KeptFactor(self.direct, self.pattern) if pays else None
+        return KeptFactor(self.pattern) if pays else None

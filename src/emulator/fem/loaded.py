@@ -47,12 +47,10 @@ class LoadedEquilibrium:
 
     scene : the scene, with ``loaded_by``.
     options : the controls of Newton's method.
-    factorisation : the name of the linear solver.
     """
 
     scene: Scene
     options: NewtonOptions
-    factorisation: str
 
     @cached_property
     def _on_mesh(self) -> Scene:
@@ -65,12 +63,12 @@ class LoadedEquilibrium:
     @cached_property
     def unloader(self) -> Unloader:
         """What finds the stress-free shape."""
-        return Unloader(self._on_mesh, options=self.options, factorisation=self.factorisation)
+        return Unloader(self._on_mesh, options=self.options)
 
     @cached_property
     def system(self) -> System:
         """The equations on the mesh, whose pattern those at rest have."""
-        return System(self._on_mesh, self.factorisation)
+        return System(self._on_mesh)
 
     def solve(self, theta: jax.Array, start: jax.Array | None) -> Solution:
         """Return the equilibrium at ``theta`` (p,), its displacement (n, 3) in mm from the mesh.

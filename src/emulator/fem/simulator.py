@@ -35,7 +35,8 @@ from emulator.fem.derivatives import (
     sensitivities,
 )
 from emulator.fem.energy import require_shape
-from emulator.fem.linear import Outcome, find_solver
+from emulator.fem.linear import Outcome
+from emulator.fem.linear.suitesparse import prepare
 from emulator.fem.loaded import LoadedEquilibrium
 from emulator.fem.newton import NewtonOptions
 from emulator.fem.reactions import balanced, nodes_of, reactions
@@ -51,23 +52,19 @@ class Simulator(TableRepr):
     ----------
     scene : the scene to simulate.
     options : the controls of Newton's method.
-    factorisation : the linear solver. ``suitesparse`` is CHOLMOD where it works and UMFPACK where
-        it does not; ``petsc`` (an extra) is MUMPS, for meshes whose factors do not fit
-        (docs/large_meshes.md).
 
     Raises
     ------
     InputError
-        A factorisation that is unknown or not installed, or JAX's default device is no CPU.
+        A version of JAX that SuiteSparse cannot be called from, or JAX's default device is no CPU.
     """
 
     scene: Scene
     options: NewtonOptions = field(default_factory=NewtonOptions)
-    factorisation: str = "suitesparse"
 
     def __post_init__(self) -> None:
         require_cpu("FEM")
-        find_solver(self.factorisation)
+        prepare()
         if self.scene.loaded_by:
             self._loaded.unloader  # noqa: B018 - raises for scenes that cannot be unloaded
 
@@ -75,13 +72,12 @@ class Simulator(TableRepr):
         """Return the title and the rows of the printed summary."""
         unknowns = int((~self.scene.held).sum())
         _, rows = self.scene.summary_rows()
-        solver = [("unknowns", str(unknowns)), ("factorisation", self.factorisation)]
-        return f"Simulator of '{self.scene.name}'", [*rows, *solver]
+        return f"Simulator of '{self.scene.name}'", [*rows, ("unknowns", str(unknowns))]
 
     @cached_property
     def system(self) -> System:
         """The discrete equations of the scene."""
-        return System(self.scene, self.factorisation)
+        return System(self.scene)
 
     @cached_property
     def _balanced(self) -> System:
@@ -89,7 +85,7 @@ class Simulator(TableRepr):
 
     @cached_property
     def _loaded(self) -> LoadedEquilibrium:
-        return LoadedEquilibrium(self.scene, self.options, self.factorisation)
+        return LoadedEquilibrium(self.scene, self.options)
 
     @property
     def stepwise(self) -> bool:

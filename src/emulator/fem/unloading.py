@@ -49,7 +49,6 @@ from emulator.fem.derivatives import (
 from emulator.fem.energy import at_points, displacement_gradient, require_rest, require_shape
 from emulator.fem.fallbacks import find_equilibrium
 from emulator.fem.inverse_motion import InverseSystem, carried_back
-from emulator.fem.linear import find_solver
 from emulator.fem.newton import NewtonOptions, largest_admissible
 from emulator.fem.solution import Solution, Status
 from emulator.geometry.discretisation import Blocks
@@ -155,7 +154,6 @@ class Unloader:
     method : ``inverse`` or ``fixed_point``; the former needs about a tenth of the factorisations
         (docs/experiments.md, "Unloading").
     options : the controls of Newton's method.
-    factorisation : the linear solver, as for a :class:`~emulator.fem.simulator.Simulator`.
 
     Raises
     ------
@@ -166,10 +164,8 @@ class Unloader:
     scene: Scene
     method: str = "inverse"
     options: NewtonOptions = field(default_factory=NewtonOptions)
-    factorisation: str = "suitesparse"
 
     def __post_init__(self) -> None:
-        find_solver(self.factorisation)
         look_up(METHODS, self.method, "method of unloading")
         require_rest(self.scene)
         if self.scene.prescribed.moves:
@@ -185,7 +181,7 @@ class Unloader:
     @cached_property
     def system(self) -> InverseSystem:
         """The equations of inverse motion."""
-        return InverseSystem(self.scene, self.factorisation)
+        return InverseSystem(self.scene)
 
     def solve(self, theta: jax.Array) -> Unloaded:
         """Return the stress-free shape; ``theta`` (p,) has the loads that the mesh is under.
@@ -236,7 +232,7 @@ def unload(scene: Scene, theta: jax.Array, **options: Any) -> Unloaded:
     scene : the scene on its loaded mesh.
     theta : the parameters (p,), with the pressure under which the image was taken; they may lie
         outside the scene's box.
-    options : the fields ``method``, ``options`` and ``factorisation`` of an :class:`Unloader`.
+    options : the fields ``method`` and ``options`` of an :class:`Unloader`.
 
     Raises
     ------
@@ -389,7 +385,7 @@ def system_at_rest(system: System, w: jax.Array, theta: jax.Array) -> System:
         _tissue=tissue,
         _block_tissue=jax.tree.map(blocks.gather, tissue),
     )
-    rest_system = System(at_rest, system.factorisation)
+    rest_system = System(at_rest)
     # Evaluated here, so that no program inside another keeps what depends on its own tracers.
     _ = rest_system.springs, rest_system.terms, rest_system.forces, rest_system.dead
     return rest_system

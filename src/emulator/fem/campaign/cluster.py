@@ -159,7 +159,7 @@ class SolverPlugin(WorkerPlugin):
         simulator, scene = solver.simulator, solver.simulator.scene
         self._scene = {each.name: getattr(scene, each.name) for each in fields(Scene)}
         self._fingerprint = scene.fingerprint
-        self._simulator_options = simulator.options, simulator.factorisation
+        self._newton = simulator.options
         self._options = solver.sensitivities, solver.energy, solver.from_rest_again
 
     def setup(self, worker: Any) -> None:  # noqa: ARG002 - Dask's interface
@@ -178,7 +178,7 @@ class SolverPlugin(WorkerPlugin):
             raise SolverError(
                 f"campaign: a worker makes another scene of '{scene.name}'; give it this version"
             )
-        return Solver(Simulator(scene, *self._simulator_options), *self._options)
+        return Solver(Simulator(scene, self._newton), *self._options)
 
 
 def _solve(name: str, task: Task) -> Row:

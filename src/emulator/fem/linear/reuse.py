@@ -16,8 +16,7 @@ import jax.numpy as jnp
 
 from emulator.fem.compiled import compiled, while_loop
 from emulator.fem.linear.pattern import Pattern
-from emulator.fem.linear.solve import Direct, Outcome, Solved
-from emulator.fem.linear.suitesparse import keeping_factors
+from emulator.fem.linear.suitesparse import Outcome, Solved, factor_and_solve, keeping_factors
 
 TOLERANCE = 1e-10  # relative residual, in the norm of the inverse factorised tangent
 _PATIENCE = 6  # iterations before conjugate gradients that converge too slowly are given up
@@ -102,15 +101,14 @@ class KeptFactor:
     pattern : the pattern of the tangents, an upper triangle.
     """
 
-    def __init__(self, direct: Direct, pattern: Pattern) -> None:
+    def __init__(self, pattern: Pattern) -> None:
         self._pattern = pattern
         self._factorised: jax.Array | None = None  # the tangent that the kept factor belongs to
         affordable = int(_ITERATIONS_OF_LARGE * (pattern.size / _LARGE) ** (2.0 / 3.0))
         self._iterations = max(_PATIENCE, affordable)
-        program = (lambda function: function) if direct.on_host else compiled
         self._product = compiled(pattern.product)
-        self._solve = program(partial(direct.solve, pattern, kind="definite"))
-        self._solve_beside = program(self._conjugate_gradients)
+        self._solve = compiled(partial(factor_and_solve, pattern, kind="definite"))
+        self._solve_beside = compiled(self._conjugate_gradients)
         self.factorisations = 0
 
     @staticmethod

@@ -19,11 +19,12 @@ import sys
 from _thread import interrupt_main
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from enum import IntEnum
 from functools import cache, partial
 from math import prod
 from pathlib import Path
 from threading import Timer
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -35,41 +36,48 @@ from threadpoolctl import ThreadpoolController
 
 from emulator.core.errors import InputError
 from emulator.fem.linear.pattern import Pattern
-from emulator.fem.linear.solve import Direct, Kind, Outcome, Solved
 
 _CHOLMOD, _UMFPACK = "calibrate_cholmod", "calibrate_umfpack"
 _FACTORS = 2  # factors of each pattern that are kept by default
 
 
-class SuiteSparse(Direct):
-    """CHOLMOD where the matrix must be definite, UMFPACK, which takes both triangles, where not."""
+class Outcome(IntEnum):
+    """How a linear solve ended, as a number that compiled programs can carry.
 
-    name = "suitesparse"
+    The solution is NaN unless the outcome is OK.
+    """
 
-    def check(self) -> None:
-        """Prepare the library, which is always installed."""
-        _prepare()
-
-    def solve(self, pattern: Pattern, values: jax.Array, rhs: jax.Array, kind: Kind) -> Solved:
-        """Return the solution and the outcome."""
-        _prepare()
-        shapes = jax.ShapeDtypeStruct(rhs.shape, jnp.float64), jax.ShapeDtypeStruct((), jnp.int32)
-        call = partial(jax.ffi.ffi_call, result_shape_dtypes=shapes, vmap_method="sequential")
-        if kind == "definite":
-            x, outcome = call(_CHOLMOD)(
-                pattern.rows, pattern.columns, values, rhs, mode=np.int64(0)
-            )
-        else:
-            trans = np.int64(kind == "transposed")
-            x, outcome = call(_UMFPACK)(*pattern.both(values), rhs, trans=trans)
-        return x, outcome
+    OK = 0
+    INDEFINITE = 1  # not positive definite; a general factorisation may still solve
+    SINGULAR = 2
 
 
-SUITESPARSE = SuiteSparse()
+Solved = tuple[jax.Array, jax.Array]
+"""A solution x, (size,) or (size, k), and its :class:`Outcome`, int32 ()."""
+
+Kind = Literal["definite", "general", "transposed"]
+"""What is solved with: a matrix that must be positive definite, given by its upper triangle, or
+else is INDEFINITE; any matrix; or the transpose of any."""
+
+
+def factor_and_solve(pattern: Pattern, values: jax.Array, rhs: jax.Array, kind: Kind) -> Solved:
+    """Return ``x`` with ``A x = rhs``, and the outcome.
+
+    CHOLMOD where the matrix must be definite, UMFPACK, which takes both triangles, where not.
+    """
+    prepare()
+    shapes = jax.ShapeDtypeStruct(rhs.shape, jnp.float64), jax.ShapeDtypeStruct((), jnp.int32)
+    call = partial(jax.ffi.ffi_call, result_shape_dtypes=shapes, vmap_method="sequential")
+    if kind == "definite":
+        x, outcome = call(_CHOLMOD)(pattern.rows, pattern.columns, values, rhs, mode=np.int64(0))
+    else:
+        trans = np.int64(kind == "transposed")
+        x, outcome = call(_UMFPACK)(*pattern.both(values), rhs, trans=trans)
+    return x, outcome
 
 
 @cache
-def _prepare() -> None:
+def prepare() -> None:
     """Register both solvers, set the threads of their BLAS and the sizes of their caches, once.
 
     The BLAS inside the sparse solver gets one thread: a second pool beside XLA's oversubscribes the
@@ -107,7 +115,7 @@ def keeping_factors(count: int) -> Iterator[None]:
     As many as threads that solve; or one, where two would not fit into memory: a factorisation
     then overwrites the one before. Contexts may be closed in any order; the latest one counts.
     """
-    _prepare()
+    prepare()
     _kept.append(count)
     sparsax.set_num_cache_size(count)
     try:
@@ -218,7 +226,7 @@ def check_api() -> None:
     if major != _API_MAJOR or minor < _API_MINOR:
         version = f"{major}.{minor}" if major >= 0 else "without a version"
         raise InputError(
-            f"factorisation 'suitesparse': jaxlib {jaxlib.__version__} has XLA FFI {version}; this "
+            f"SuiteSparse: jaxlib {jaxlib.__version__} has XLA FFI {version}; this "
             f"version of the package needs {_API_MAJOR}.{_API_MINOR} or a later {_API_MAJOR}.x, as "
             "in jax 0.10.2 to 0.12"
         )
