@@ -211,15 +211,6 @@ COMMANDS = [
         "--fem-runs has no effect without --forward reduced",
     ),
     (
-        "sensitivity liver --field --scheduler tcp://127.0.0.1:9",
-        "--scheduler has no effect without --forward fem",
-    ),
-    (
-        "check sbc once_clamped_beam --scheduler tcp://127.0.0.1:9 --out x",
-        "--scheduler has no effect without --fem-data",
-    ),
-    ("certify kept --scheduler luck", "'luck' is no address; give e.g. tcp://127.0.0.1:8786"),
-    (
         "certify edited",
         'sampled with noise = {"displacement": 0.2}, but run.json says {"displacement": 2.0}',
     ),

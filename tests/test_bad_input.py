@@ -83,18 +83,12 @@ PYTHON = [
     (lambda: cal.NUTSOptions(draws=0), "draws is 0; it must be 1 or more"),
     (lambda: cal.campaign(BEAM), "give a number of samples or thetas, one of them"),
     (lambda: cal.campaign(BEAM, 2, design="luck"), "design 'luck' is unknown"),
-    (lambda: cal.campaign(BEAM, 2, scheduler="luck"), "scheduler 'luck' is no address"),
     (lambda: cal.sensitivity(linear_forward(BEAM)), "give something to observe"),
     (
         lambda: cal.sensitivity(linear_forward(BEAM), OBSERVE, samples=3),
         "3 samples; give 2 or more",
     ),
-    (
-        lambda: cal.sensitivity(linear_forward(BEAM), OBSERVE, scheduler="tcp://127.0.0.1:9"),
-        "a linear map solves no FEM, so a scheduler has no effect; take fem_forward",
-    ),
     (lambda: sbc(model(), 3), "3 replicates; give 20 or more"),
-    (lambda: sbc(model(), scheduler="tcp://127.0.0.1:9"), "a linear map solves no FEM"),
     (lambda: cal.compare({}), "compare: 0 posterior is given; give two or more"),
     (lambda: cal.truncated_normal(1.0, -1.0, low=0.0, high=2.0), "-1"),
     (lambda: read_measurements(BEAM, "none.csv"), "none.csv does not exist"),

@@ -31,7 +31,7 @@ def test_what_the_readme_imports_is_there():
             "assert jax.config.jax_enable_x64; assert dict(os.environ) == before;"
             # The libraries behind it take seconds, and are imported by what needs them.
             "slow = {'matplotlib', 'numpyro', 'blackjax', 'arviz_stats', 'flax', 'sklearn',"
-            "        'skfem', 'xarray', 'zarr', 'dask', 'distributed'};"
+            "        'skfem', 'xarray', 'zarr'};"
             "assert not slow & set(sys.modules), slow & set(sys.modules)",
             id="importing turns on float64, loads JAX and does nothing else",
         ),

@@ -25,7 +25,6 @@ QUICK = {
     "beam_coverage": "PUBLISHED --cases 2",
     "biaxial": "--quick",
     "blood_clots": "--data MEASURED/blood_clots --quick",
-    "campaign": "--quick",
     "certificate": "--quick",
     "decoder_speed": "--quick",
     "effects": "--quick",

@@ -19,7 +19,7 @@ probability c covers the truth where :math:`|u - 1/2| < c / 2`.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -33,8 +33,6 @@ from calibrate.posterior.posterior import sample
 from calibrate.statistical_model import Model
 from emulator.core.display import counting
 from emulator.core.errors import InputError, check_seed
-from emulator.fem.campaign import executor, in_process
-from emulator.surrogates.fem import solved_by
 
 LOG_LIKELIHOOD = "log likelihood"
 """Name of the quantity that depends on the data."""
@@ -198,7 +196,6 @@ def sbc(
     seed: int = 0,
     progress: bool = False,
     draw: Sample | None = None,
-    scheduler: str | None = None,
 ) -> Calibration:
     """Return the simulation-based calibration of ``model``, its forward map and a sampler.
 
@@ -209,13 +206,10 @@ def sbc(
     draws : the number of draws of each posterior that are ranked, evenly spaced along the chains,
         because draws that depend on each other make the ranks too even or too extreme.
     draw : the function that draws from a posterior instead of a sampler.
-    scheduler : the address of a Dask scheduler whose workers make the data, for a ``truth`` with
-        FEM as its forward map.
 
     Raises
     ------
     InputError
-        A scheduler that does not answer, or a truth that solves no FEM.
         ``truth`` does not have the unknowns and observations of ``model``.
     """
     _check_count(replicates)
@@ -235,12 +229,7 @@ def sbc(
         rows = np.linspace(0, len(every[model.names[0]]) - 1, draws).astype(int)
         return {name: values[rows] for name, values in every.items()}
 
-    if scheduler is not None:
-        solved_by(truth.forward, in_process)  # a map that solves nothing is refused at once
-    with executor(scheduler) as execute:
-        if scheduler is not None:
-            truth = replace(truth, forward=solved_by(truth.forward, execute))
-        data_sets = predictions.prior_replicates(truth, jax.random.key(seed), replicates)
+    data_sets = predictions.prior_replicates(truth, jax.random.key(seed), replicates)
     if (found := len(data_sets.draws[truth.names[0]])) < _FEWEST:
         raise InputError(f"calibration: {predictions.shortfall(found, replicates)[0]}")
     each = _replicates(model, data_sets, draw or sampled, seed, progress=progress)

@@ -43,8 +43,6 @@ from calibrate.measurements.outputs import FIELD, Outputs
 from calibrate.priors import Prior, bisect, bounds, box_prior, dependence_of
 from calibrate.statistical_model.prior_range import fit_to
 from emulator.core.errors import InputError, check_known, check_seed
-from emulator.fem.campaign import executor, in_process
-from emulator.surrogates.fem import solved_by
 from emulator.surrogates.protocol import ForwardMap
 
 _EDGE = 1e-9  # cut off the unit interval, because unbounded priors have infinite quantiles at 0
@@ -312,7 +310,6 @@ def sensitivity(
     groups: Mapping[str, Sequence[str]] | None = None,
     field: bool = False,
     seed: int = 0,
-    scheduler: str | None = None,
 ) -> xr.DataTree:
     """Return how much each parameter moves each observation.
 
@@ -324,7 +321,6 @@ def sensitivity(
     method, samples : the arguments of :func:`analyse`.
     groups : the parameters that vary together, by the group's name.
     field : whether the size of every node's displacement is analysed, too.
-    scheduler : the address of a Dask scheduler whose workers solve, for a map that is FEM.
 
     Returns
     -------
@@ -336,8 +332,7 @@ def sensitivity(
     ------
     InputError
         Nothing to analyse; several load states; correlated parameters; a prior that leaves the
-        range in which the map answers; a scheduler that does not answer, or beside a map that
-        solves no FEM.
+        range in which the map answers.
     """
     scene = forward.scene
     if observe is None and not field:
@@ -345,8 +340,6 @@ def sensitivity(
     parts = {} if observe is None else dict(observations(observe).parts)
     if observe is not None and observations(observe).states != ("",):
         raise InputError("sensitivity: observations of several load states; take one at a time")
-    if scheduler is not None:
-        solved_by(forward, in_process)  # a map that solves nothing is refused before connecting
     prior = box_prior(scene) if prior is None else prior
     dependence = dependence_of(prior)
     if dependence is not None and np.any(dependence.correlation != np.eye(len(dependence.names))):
@@ -357,15 +350,13 @@ def sensitivity(
     prior, _ = fit_to(forward, prior)
     factors = Factors(scene.parameter_names, dict(groups or {}))
     datasets = {}
-    with executor(scheduler) as execute:
-        solving = forward if scheduler is None else solved_by(forward, execute)
-        outputs = Outputs(solving, parts, field=field, what="sensitivity")
-        points = _design(factors, method, samples, seed)
-        thetas = quantiles(prior, factors.names, jnp.asarray(points))
-        values, slopes = outputs.values(thetas), None
-        if method == "derivatives":
-            density = np.asarray(densities(prior, factors.names, thetas))
-            slopes = outputs.slopes(thetas) / density[:, None, :]
+    outputs = Outputs(forward, parts, field=field, what="sensitivity")
+    points = _design(factors, method, samples, seed)
+    thetas = quantiles(prior, factors.names, jnp.asarray(points))
+    values, slopes = outputs.values(thetas), None
+    if method == "derivatives":
+        density = np.asarray(densities(prior, factors.names, thetas))
+        slopes = outputs.slopes(thetas) / density[:, None, :]
     for name, entries in outputs.places.items():
         some = None if slopes is None else slopes[:, entries]
         data = _analysed(factors, method, seed, points, values[:, entries], some)

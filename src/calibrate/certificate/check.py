@@ -50,7 +50,6 @@ from emulator.core.display import Stages, counting
 from emulator.core.errors import InputError, check_arguments
 from emulator.core.machine import one_blas_thread
 from emulator.fem import Simulator
-from emulator.fem.campaign import executor
 
 _BEGIN, _AT_MOST = 70, 200  # FEM runs by default
 _FEWEST = 25
@@ -92,7 +91,6 @@ def examine(
     at_most: int | None = None,
     mesh: int | None = None,
     seed: int = 0,
-    scheduler: str | None = None,
     progress: bool = False,
     stages: Stages | None = None,
 ) -> Check:
@@ -104,14 +102,13 @@ def examine(
     at_most : the number of runs up to which they are doubled while the verdict is undecided.
     mesh : the largest number of solves on the next finer mesh (:mod:`calibrate.certificate.mesh`),
         by default 30; 0 for none.
-    scheduler : the address of a Dask scheduler whose workers solve; by default this process does.
     stages : the record of the seconds of each stage.
 
     Raises
     ------
     InputError
         The simulator is for another scene, the number of runs is too small, or ``at_most`` is below
-        it, or the scheduler does not answer.
+        it.
     """
     count, most = _checked_counts(draws, at_most, mesh)
     stages = Stages(show=False) if stages is None else stages
@@ -120,10 +117,9 @@ def examine(
     z = predictive.unconstrain(posterior.draws())
     with (
         one_blas_thread(),
-        executor(scheduler) as execute,
         counting(total=count, desc="FEM check", disable=not progress, unit="run") as bar,
     ):
-        solver = Solver(predictive, FEMLikelihood(posterior.model, simulator, execute), bar)
+        solver = Solver(predictive, FEMLikelihood(posterior.model, simulator), bar)
         with stages("FEM where the map was asked"):
             rows = np.linspace(0, len(z) - 1, max(round(_AT_DRAWS * count), 5)).astype(int)
             at_draws = solver(z[rows], stability=_STABILITY)

@@ -99,12 +99,6 @@ def seed_option(what: str) -> Option:
     return option("--seed", type=int, default=0, help=f"seed of {what} (default 0)")
 
 
-def scheduler_option(which: str) -> Option:
-    """Return ``--scheduler``; ``which`` names the solves that go there."""
-    text = f"{which} on the workers of this Dask scheduler, e.g. tcp://127.0.0.1:8786"
-    return option("--scheduler", "ADDRESS", text)
-
-
 def load_steps_option(default: int | None = 1) -> Option:
     """Return ``--load-steps``; without a ``default`` it is the run's."""
     usual = "the run's own" if default is None else default
@@ -155,15 +149,6 @@ def theta_of(arguments: Namespace, scene: Scene) -> jax.Array:
 def theta_by_name(scene: Scene, theta: Any) -> dict[str, float]:
     """Return a theta (p,) as a result has it."""
     return dict(zip(scene.parameter_names, map(float, theta), strict=True))
-
-
-def scheduler_word(arguments: Namespace) -> str | None:
-    """Return the address of :func:`scheduler_option`; :class:`InputError` for another word."""
-    if arguments.scheduler is not None:
-        from emulator.fem.campaign.cluster import check_address
-
-        check_address(arguments.scheduler)
-    return arguments.scheduler
 
 
 def add_forward(parser: ArgumentParser, default: str | None = "emulator") -> None:

@@ -16,7 +16,7 @@ from calibrate.provenance import versions
 from emulator.core.display import counting
 from emulator.core.errors import InputError, look_up
 from emulator.fem import NewtonOptions, Simulator
-from emulator.fem.campaign import Neighbours, Solver, executor, solve_rows
+from emulator.fem.campaign import Neighbours, Solver, solve_rows
 from emulator.fem.campaign.designs import DESIGNS
 from emulator.fem.campaign.store import Campaign, ZarrRows, make_store, writing
 from emulator.scenes.scene import Scene
@@ -31,7 +31,6 @@ def campaign(
     seed: int = 0,
     slopes: bool = False,
     out: str | Path | None = None,
-    scheduler: str | None = None,
     options: NewtonOptions | None = None,
     progress: bool = False,
 ) -> xr.Dataset:
@@ -50,7 +49,6 @@ def campaign(
     thetas : the theta (c, p), in place of a design.
     slopes : solve for du/dtheta, too.
     out : the Zarr store to write; without it the dataset is in memory.
-    scheduler : the address of a Dask scheduler whose workers solve; without it this process does.
 
     Returns
     -------
@@ -60,15 +58,13 @@ def campaign(
     Raises
     ------
     InputError
-        No samples and no theta; a store of another campaign; a scheduler that does not answer.
-    SolverError
-        The cluster was lost; what was solved is in the store.
+        No samples and no theta; a store of another campaign.
     """
     plan = question(
         scene, samples, thetas=thetas, design=design, seed=seed, slopes=slopes, options=options
     )
     store = zarr.storage.MemoryStore() if out is None else out
-    fill(plan, store, scheduler=scheduler, progress=progress)
+    fill(plan, store, progress=progress)
     return xr.open_zarr(store, chunks=None)
 
 
@@ -103,20 +99,17 @@ def question(
     return Campaign(solver, points, {"design": design_record, "versions": versions()})
 
 
-def fill(
-    plan: Campaign, store: Any, *, scheduler: str | None = None, progress: bool = False
-) -> int:
+def fill(plan: Campaign, store: Any, *, progress: bool = False) -> int:
     """Solve what a store, at a path or in memory, lacks; return how many rows were solved."""
     in_memory = isinstance(store, zarr.storage.MemoryStore)
     opened = nullcontext(ZarrRows(make_store(store, plan))) if in_memory else writing(store, plan)
-    with executor(scheduler) as execute, opened as rows:
+    with opened as rows:
         missing, total = rows.missing(), len(rows.thetas)
         solved = solve_rows(
             plan.solver,
             jnp.asarray(rows.thetas),
             numbers=missing,
             starts=Neighbours(plan.scene, rows.thetas, rows),
-            execute=execute,
         )
         with counting(
             total=total, initial=total - len(missing), desc="FEM", disable=not progress, unit="run"

@@ -18,7 +18,7 @@ from jax.flatten_util import ravel_pytree
 from calibrate.statistical_model.model import Data, Model
 from emulator.core.errors import InputError, SolverError
 from emulator.fem import Simulator
-from emulator.fem.campaign import Executor, Solver, in_process, solve_rows
+from emulator.fem.campaign import Solver, solve_rows
 from emulator.fem.energy import volume_ratio
 
 
@@ -52,15 +52,14 @@ class FEMLikelihood:
 
     model : the statistical model.
     simulator : the FEM simulator of the model's scene.
-    execute : the executor of the solves, in this process by default.
 
     :class:`InputError` where the simulator is for another scene.
     """
 
-    def __init__(self, model: Model, simulator: Simulator, execute: Executor = in_process) -> None:
+    def __init__(self, model: Model, simulator: Simulator) -> None:
         if simulator.scene.fingerprint != model.forward.scene.fingerprint:
             raise InputError("the simulator's scene is not the posterior's")
-        self.model, self.simulator, self.execute = model, simulator, execute
+        self.model, self.simulator = model, simulator
         self._solver = Solver(simulator, from_rest_again=False)
         self._start, self._cheap = jax.jit(model.full), jax.jit(model.map_log_likelihood)
         self._fem, self._derivatives = jax.jit(self._by_fem), jax.jit(self._slopes_of_means)
@@ -118,7 +117,6 @@ class FEMLikelihood:
             thetas,
             numbers=numbers,
             starts=lambda k: (self._start(thetas[k]),),
-            execute=self.execute,
         ):
             number, state = divmod(row.number, states)
             if number not in solutions:

@@ -9,9 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.core.errors import InputError
 from emulator.core.store import to_json
-from emulator.fem.campaign import Executor, Row, Solver, in_process, solve_rows
+from emulator.fem.campaign import Row, Solver, solve_rows
 from emulator.fem.simulator import Simulator
 from emulator.scenes.scene import Scene, all_nodes, check_nodes
 from emulator.surrogates.protocol import ForwardKind, ForwardMap, Prediction, fingerprint_of
@@ -19,19 +18,17 @@ from emulator.surrogates.protocol import ForwardKind, ForwardMap, Prediction, fi
 
 @dataclass(frozen=True, eq=False)
 class FEMForward:
-    """The simulator as a forward map: its predictions at many theta are done by an executor.
+    """The simulator as a forward map: several theta are solved at once, by threads.
 
     All other maps are compiled and differentiated by JAX.
 
     simulator, nodes : the simulator, and the nodes (k,) whose displacement is returned.
     start : the map that predicts where Newton's method begins; ``None`` for the body at rest.
-    execute : the executor that solves at many theta; by default in this process.
     """
 
     simulator: Simulator
     nodes: np.ndarray
     start: ForwardMap | None = None
-    execute: Executor = in_process
 
     kind = "fem"
     label = "FEM"
@@ -54,7 +51,7 @@ class FEMForward:
         return Prediction(solution.displacement[self.nodes], solution.converged)
 
     def evaluate_all(self, thetas: jax.Array) -> Prediction:
-        """Return the predictions at many theta (c, p), which ``execute`` solves."""
+        """Return the predictions at many theta (c, p)."""
         return self._solved(thetas)[0]
 
     def slopes_all(self, thetas: jax.Array) -> tuple[Prediction, jax.Array]:
@@ -68,7 +65,7 @@ class FEMForward:
         solver = Solver(self.simulator, sensitivities=sensitivities, from_rest_again=False)
         start = self.start
         starts = (lambda _: ()) if start is None else (lambda number: (start(thetas[number]),))
-        solved = solve_rows(solver, thetas, starts=starts, execute=self.execute)
+        solved = solve_rows(solver, thetas, starts=starts)
         rows = sorted(solved, key=lambda row: row.number)
         u = jnp.stack([row.solution.displacement[self.nodes] for row in rows])
         return Prediction(u, jnp.stack([row.solution.converged for row in rows])), rows
@@ -87,19 +84,8 @@ def fem_forward(simulator: Simulator, start: ForwardMap | None = None) -> FEMFor
     return FEMForward(simulator, all_nodes(simulator.scene), start)
 
 
-def solved_by(forward: ForwardMap, execute: Executor) -> FEMForward:
-    """Return ``forward`` with its solves done by ``execute``; refuse a map that solves nothing."""
-    if not isinstance(forward, FEMForward):
-        raise InputError(
-            f"a {forward.kind} map solves no FEM, so a scheduler has no effect; take fem_forward, "
-            "or leave the scheduler out"
-        )
-    return replace(forward, execute=execute)
-
-
 FEM = ForwardKind(
     "fem",
     "finite elements, from rest each time",
     lambda ingredients, _: fem_forward(ingredients.simulator),
-    words=("scheduler",),
 )

@@ -159,8 +159,7 @@ class ForwardKind:
     to_arrays, from_arrays : write and read the arrays of a map that is fitted while it is built,
         because a second fit may give another map; they are kept with results. ``from_arrays``
         raises ``KeyError`` where one is missing. ``None`` for a kind that is not fitted.
-    words : the further words that have an effect: ``emulator`` where one is an ingredient,
-        ``scheduler`` where a prediction is a FEM solve, which workers of a cluster can do.
+    words : the further words that have an effect: ``emulator`` where one is an ingredient.
     """
 
     name: str

@@ -58,7 +58,7 @@ def full_options(name: str, options: Mapping[str, Any]) -> dict[str, int]:
 
 
 def check_words(name: str, **words: str | None) -> None:
-    """Refuse an ``emulator`` or a ``scheduler`` that has no effect on the kind called ``name``."""
+    """Refuse an ``emulator`` that has no effect on the kind called ``name``."""
     for word, value in words.items():
         owners = [kind.name for kind in FORWARD_MAPS.values() if word in kind.words]
         if value is not None and name not in owners:

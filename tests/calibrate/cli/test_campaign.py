@@ -7,7 +7,6 @@ import zarr
 
 from calibrate.cli import main
 from cli_support import SCENE, answer, complaint, write_block
-from emulator.fem.campaign import cluster
 
 
 @pytest.fixture(scope="module")
@@ -63,21 +62,6 @@ def test_stores_that_are_none(capsys, block, store, tmp_path):
     other.write_text(changed.replace("block.vtu", str(block.parent / "block.vtu")))
     said = complaint(capsys, "campaign", other, "--samples", 3, "--out", store)
     assert "is of scene 'scene' with another mesh, law, load or range" in said
-
-
-@pytest.mark.parametrize(
-    ("address", "message"),
-    [
-        ("localhost", "'localhost' is no address; give e.g. tcp://127.0.0.1:8786"),
-        ("http://127.0.0.1:8786", "is no address"),
-        ("tcp://127.0.0.1:9", "tcp://127.0.0.1:9 does not answer within 0.3 s; is it running?"),
-    ],
-)
-def test_schedulers_that_are_none(capsys, monkeypatch, block, tmp_path, address, message):
-    monkeypatch.setattr(cluster, "CONNECT_S", 0.3)
-    words = ("--samples", 3, "--out", tmp_path / "runs.zarr", "--scheduler", address)
-    assert message in complaint(capsys, "campaign", block, *words)
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow

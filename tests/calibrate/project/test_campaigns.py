@@ -1,12 +1,10 @@
 """Campaigns: what is in the store, and that nothing is lost or solved twice."""
 
-import os
 import signal
 import subprocess
 import sys
 import threading
 import time
-from contextlib import ExitStack
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +15,7 @@ import zarr
 
 import calibrate as cal
 import emulator as em
-from emulator.core.errors import InputError, SolverError
+from emulator.core.errors import InputError
 from emulator.fem import sobol
 from emulator.fem.campaign.store import ZarrRows, read_runs
 from emulator.fem.solution import Status
@@ -178,71 +176,3 @@ def test_a_killed_process_loses_nothing(tmp_path):
     # What was there has not been solved again.
     for name in ("displacement", "seconds"):
         np.testing.assert_array_equal(after[name][there], before[name][there])
-
-
-@pytest.fixture(scope="module")
-def cluster():
-    """Two worker processes, started again when they die."""
-    distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
-    ) as found:
-        yield found
-
-
-@pytest.mark.slow
-def test_on_a_cluster_with_a_worker_killed(scene, cluster, tmp_path):
-    path, count = tmp_path / "runs.zarr", 60
-    victim = next(iter(cluster.workers.values())).pid
-    watch = when(path, 10, lambda: os.kill(victim, signal.SIGKILL))
-    cal.campaign(scene, count, out=path, scheduler=cluster.scheduler_address)
-    watch.join(timeout=10)
-    assert not watch.is_alive()
-    assert_whole(xr.open_zarr(path), scene, count)
-    # The other worker, or the killed one's successor, knows the scene too.
-    again = cal.campaign(scene, 4, slopes=True, scheduler=cluster.scheduler_address)
-    np.testing.assert_allclose(
-        again["sensitivities"], cal.campaign(scene, 4, slopes=True)["sensitivities"], atol=1e-8
-    )
-
-
-@pytest.fixture
-def lonely():
-    """A scheduler and one worker that nobody starts again: address, and both processes."""
-    with ExitStack() as stack:
-
-        def start(*words):
-            command = [sys.executable, "-m", *words, "--no-dashboard"]
-            process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-            stack.callback(process.stderr.close)
-            stack.callback(process.wait)
-            stack.callback(process.kill)
-            return process
-
-        scheduler = start("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0")
-        line = next(line for line in scheduler.stderr if "Scheduler at:" in line)
-        address = line.split("Scheduler at:")[1].strip()
-        worker = start("distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny")
-        yield address, scheduler, worker
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("lost", "message"),
-    [("worker", "has had no worker for 1 s"), ("scheduler", "does not answer")],
-)
-def test_a_cluster_that_is_lost(scene, lonely, tmp_path, monkeypatch, lost, message):
-    """A campaign ends in one line and keeps its rows."""
-    from emulator.fem.campaign import cluster as module
-
-    address, *processes = lonely
-    path = tmp_path / "runs.zarr"
-
-    def lose():
-        monkeypatch.setattr(module, "WORKERS_S", 1.0)
-        processes[lost == "worker"].kill()
-
-    when(path, 3, lose)
-    with pytest.raises(SolverError, match=message):
-        cal.campaign(scene, 5000, out=path, scheduler=address)
-    assert solved_rows(path) >= 3

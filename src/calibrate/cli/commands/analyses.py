@@ -261,7 +261,6 @@ _COLUMNS = {
     ),
     words.add_forward,
     option("--emulator", "NAME|DIR", "default: the one shipped"),
-    words.scheduler_option("with --forward fem, the FEM runs"),
     words.seed_option("the design, of random landmarks and of FEM runs"),
     option("--out", "DIR", "write sensitivity.nc, figures, and the map as VTU"),
     help="which parameter moves which observation",
@@ -277,11 +276,9 @@ def sensitivity(arguments: Namespace) -> Answer:
     from calibrate.project.run import with_absolute_paths
     from emulator import Simulator
     from emulator.surrogates.protocol import Ingredients
-    from emulator.surrogates.registry import build_forward, check_words, full_options
+    from emulator.surrogates.registry import build_forward, full_options
 
     check_seed(arguments.seed, "sensitivity")
-    check_words(arguments.forward, scheduler=arguments.scheduler)
-    scheduler = words.scheduler_word(arguments)
     scene = words.scene_of(arguments)
     if arguments.out:
         check_folder(arguments.out)
@@ -300,7 +297,6 @@ def sensitivity(arguments: Namespace) -> Answer:
         groups=groups,
         field=arguments.field,
         seed=arguments.seed,
-        scheduler=scheduler,
     )
     if arguments.out:
         _write_indices(indices, scene, Path(arguments.out))

@@ -34,7 +34,6 @@ _OUT = option("--out", "DIR", required=True)
         nargs="+",
         default=[],
     ),
-    words.scheduler_option("with --fem-data, the FEM runs"),
     option("--warmup", type=int, default=200),
     option("--draws", type=int, default=250),
     option("--chains", type=int, default=2),
@@ -50,9 +49,6 @@ def _sbc(arguments: Namespace) -> Answer:
     from calibrate.samplers import AutoOptions
 
     folder, progress = check_folder(arguments.out), not arguments.json
-    if arguments.scheduler is not None and not arguments.fem_data:
-        raise InputError("--scheduler has no effect without --fem-data")
-    scheduler = words.scheduler_word(arguments)
     problem = problem_of(arguments)
     run, model = problem.run, model_before_data(problem, progress=progress)
     truth = model
@@ -68,7 +64,6 @@ def _sbc(arguments: Namespace) -> Answer:
         options=options,
         seed=run.seed,
         progress=progress,
-        scheduler=scheduler,
     )
     result = calibration.to_json()
     write_json(folder / "calibration.json", result)

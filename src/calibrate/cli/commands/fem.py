@@ -200,15 +200,13 @@ def _add_design(parser: ArgumentParser) -> None:
     words.seed_option("the design"),
     flag("--slopes", "du/dtheta, too"),
     words.load_steps_option(),
-    words.scheduler_option("solve"),
     option("--out", "STORE.zarr", required=True),
     help="FEM at many theta, into one Zarr store",
     description="Solves a scene at every theta of a design and writes one Zarr store, which "
     "xarray.open_zarr reads: displacement over theta_id, node and xyz, with status and hash of "
     "each row. The same command, given again, solves what is missing.",
     epilog="examples: calibrate campaign left_ventricle --samples 200 --out runs.zarr; "
-    "calibrate campaign scene.toml --samples 2000 --slopes --scheduler tcp://127.0.0.1:8786 "
-    "--out runs.zarr; calibrate train left_ventricle --campaign runs.zarr --out emulator",
+    "calibrate train left_ventricle --campaign runs.zarr --out emulator",
 )
 def campaign(arguments: Namespace) -> Answer:
     """Solve what the store lacks, and count rows by their status."""
@@ -221,7 +219,7 @@ def campaign(arguments: Namespace) -> Answer:
         raise InputError(f"--out {out}: the store's name must end in .zarr")
     scene, options = words.scene_of(arguments), NewtonOptions.load_steps(arguments.load_steps)
     plan = words.parameters(question, arguments) | {"scene": scene, "options": options}
-    solved = fill(question(**plan), out, scheduler=arguments.scheduler, progress=not arguments.json)
+    solved = fill(question(**plan), out, progress=not arguments.json)
     counts = count_statuses(out)
     samples, seconds = sum(counts.values()), time.perf_counter() - start
     result = {

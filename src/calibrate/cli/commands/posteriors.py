@@ -90,7 +90,6 @@ def _add_solves(parser: ArgumentParser) -> None:
     _add_solves,
     words.load_steps_option(default=None),
     option("--reweight", "DIR2", "write FEM's posterior, reweighted from the check, there"),
-    words.scheduler_option("the FEM runs"),
     help="check a posterior against FEM",
 )
 def certify(arguments: Namespace) -> Answer:
@@ -106,7 +105,6 @@ def certify(arguments: Namespace) -> Answer:
         at_most = 1000 if at_most is None else at_most
     elif at_most is not None:
         raise InputError("--at-most is of --until decided; give both, or --draws")
-    scheduler = words.scheduler_word(arguments)
     run, posterior = read_posterior(arguments.folder)
     certificate = certify_and_keep(
         posterior,
@@ -116,7 +114,6 @@ def certify(arguments: Namespace) -> Answer:
         mesh=0 if arguments.no_mesh else arguments.mesh_runs,
         load_steps=run.load_steps if arguments.load_steps is None else arguments.load_steps,
         reweight_to=arguments.reweight,
-        scheduler=scheduler,
         progress=not arguments.json,
     )
     result = report(run, posterior, certificate)

@@ -1,9 +1,8 @@
-"""FEM at many theta: the one loop over solves, in this process or on a Dask cluster.
+"""FEM at many theta: the one loop over solves.
 
 A design of theta (:mod:`.designs`) becomes tasks, each with displacements to start from
-(:mod:`.campaign`). An executor solves them, several at once (:mod:`.workers`, :mod:`.cluster`), and
-returns rows as they are finished, which are kept in memory or in a Zarr store (:mod:`.store`). Zarr
-and Dask are imported only with the modules that need them.
+(:mod:`.campaign`). Threads solve several at once (:mod:`.workers`); rows are kept in memory or in a
+Zarr store (:mod:`.store`), which is imported only by those who need it.
 """
 
 from emulator.fem.campaign.campaign import (
@@ -12,15 +11,13 @@ from emulator.fem.campaign.campaign import (
     Predictor,
     Runs,
     StoredRuns,
-    executor,
     run_campaign,
     solve_rows,
     solve_together,
 )
-from emulator.fem.campaign.workers import Executor, Row, Solver, Task, at_once, in_order, in_process
+from emulator.fem.campaign.workers import Row, Solver, Task, at_once, in_order
 
 __all__ = [
-    "Executor",
     "Field",
     "Neighbours",
     "Predictor",
@@ -30,9 +27,7 @@ __all__ = [
     "StoredRuns",
     "Task",
     "at_once",
-    "executor",
     "in_order",
-    "in_process",
     "run_campaign",
     "solve_rows",
     "solve_together",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import takewhile
@@ -15,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.display import counting
-from emulator.fem.campaign.workers import Executor, Row, Solver, Task, in_process
+from emulator.fem.campaign.workers import Row, Solver, Task, at_once, in_order
 from emulator.fem.simulator import Simulator
 from emulator.fem.solution import Solution
 from emulator.scenes.scene import Scene
@@ -33,7 +32,6 @@ def solve_rows(
     *,
     numbers: Iterable[int] | None = None,
     starts: Starts = lambda _: (),
-    execute: Executor = in_process,
 ) -> Iterator[Row]:
     """Solve at every theta (c, p), lazily: few rows are begun before they are asked for.
 
@@ -44,7 +42,7 @@ def solve_rows(
     """
     rows = range(len(thetas)) if numbers is None else numbers
     tasks = (Task(number, thetas[number], tuple(starts(number))) for number in rows)
-    return execute(solver, tasks)
+    return in_order(solver, tasks, at_once(solver.simulator))
 
 
 def solve_together(simulator: Simulator, thetas: jax.Array) -> Solution:
@@ -56,18 +54,6 @@ def solve_together(simulator: Simulator, thetas: jax.Array) -> Solution:
 def _stacked[Fields](each: Sequence[Fields]) -> Fields:
     stacked: Fields = jax.tree.map(lambda *fields: jnp.stack(fields), *each)
     return stacked
-
-
-def executor(scheduler: str | None) -> AbstractContextManager[Executor]:
-    """Return the executor of this process, or of the Dask scheduler at the address ``scheduler``.
-
-    Entering it raises :class:`InputError` where the address is malformed or nobody answers there.
-    """
-    if scheduler is None:
-        return nullcontext(in_process)
-    from emulator.fem.campaign.cluster import connected
-
-    return connected(scheduler)
 
 
 class Field(NamedTuple):

@@ -69,7 +69,7 @@ class Row(NamedTuple):
         return bool(self.solution.converged)
 
     def as_numpy(self) -> Row:
-        """Return the row with NumPy arrays, to send and to store."""
+        """Return the row with NumPy arrays, to store."""
         return jax.tree.map(np.asarray, self)._replace(number=self.number, seconds=self.seconds)
 
 
@@ -142,19 +142,10 @@ def _best(system: System, starts: jax.Array, theta: jax.Array) -> jax.Array:
 
 
 # ---- many solves ---------------------------------------------------------------------------------
-Executor = Callable[[Solver, Iterator[Task]], Iterator[Row]]
-"""Solves tasks and yields rows as they are finished, taking a task when it can begin it."""
-
-
-def in_process(solver: Solver, tasks: Iterator[Task]) -> Iterator[Row]:
-    """Solve in this process: as many tasks at once as it has cores and memory for."""
-    return in_order(solver, tasks, at_once(solver.simulator))
-
-
 def at_once(simulator: Simulator, nodes: int | None = None) -> int:
     """Return how many solves this machine does at once, limited by its cores and its memory.
 
-    It is 1 on large meshes, where a factor is kept between solves or Python calls the solver, and
+    It is 1 on large meshes, where a factor is kept between solves, and
     for a simulator of another class: only FEM simulators of this package are known to be
     thread-safe.
 
