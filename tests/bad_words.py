@@ -296,18 +296,6 @@ INFERENCES = [
         "--truth mu=73 lam=61 --noise displacement=correlated:length=0,sd=1,spatial_sd=1",
         "length (mm) is 0.0; it",
     ),
-    (
-        "--truth mu=73 lam=61 --discrepancy displacement=1",
-        "--discrepancy: 'displacement=1' is wrong; write it as in disp",
-    ),
-    (
-        "--truth mu=73 lam=61 --discrepancy volume=1:20",
-        "discrepancy: 'volume' is not observed; observed: displacement",
-    ),
-    (
-        "--truth mu=73 lam=61 --discrepancy displacement=1:-20",
-        "correlation length (mm) is -20.0; it must be above 0",
-    ),
     ("--truth mu=73", "no value for parameter 'lam'"),
     ("--truth mu=73 lam=10", "parameter 'lam' is 10 kPa"),
     ("--truth mu=73 lam=61 --observe 4000", "node 4000 is unknown"),

@@ -29,7 +29,7 @@ from .measurements import (
 )
 from .measurements.full_field import FullField, field_data, read_full_field
 from .model_error import placement, rigid_motion
-from .noise import CorrelatedNoise, DiscrepancyNoise, GaussianNoise, StudentTNoise
+from .noise import CorrelatedNoise, GaussianNoise, StudentTNoise
 from .population import Hierarchy, hierarchy, read_hierarchy
 from .posterior import Posterior, sample
 from .posterior.comparison import compare
@@ -84,7 +84,6 @@ __all__ = [
     "CorrelatedNoise",
     "Density",
     "Dependence",
-    "DiscrepancyNoise",
     "FullField",
     "GaussianNoise",
     "Hierarchy",

@@ -5,7 +5,7 @@
     python -m studies.living_skin --judge DIR         # DIR has the frames that were kept apart
 
 Writes results.json, with 90 % bands of 60 points and of the force at motions of the pad that were
-kept apart, and living_skin.png. It takes Gmsh.
+kept apart, living_skin.png and inclusions.png. It takes Gmsh.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from studies.common.output import Case, Results, parser, run
 from studies.living_skin.bands import ALONG, FORCE_SD, LENGTH, SD, Bands, bands_of, judged
-from studies.living_skin.figures import draw
+from studies.living_skin.figures import draw, draw_inclusions
 from studies.living_skin.skin import (
     FORCE,
     HEALTHY,
@@ -362,6 +362,7 @@ def main() -> None:
         coverage=coverage(made),
         elements_inside=float(np.mean([case["inside"] for case in inclusions])),
     )
+    draw_inclusions(inclusions[:3], arguments.out / "inclusions.png")
     draw({case["name"]: case for case in results.cases}, data, arguments.out / "living_skin.png")
 
 

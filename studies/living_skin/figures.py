@@ -46,3 +46,25 @@ def draw(cases: dict[str, Case], data: Path, path: Path) -> None:
             axis.set(aspect="equal", title=words, xlabel="x (mm)", ylabel="y (mm)")
             figure.colorbar(dots, ax=axis, shrink=0.7)
     save(figure, path, dpi=80)
+
+
+def draw_inclusions(cases: list[Case], path: Path) -> None:
+    """Truth, mean and sd of twins with a stiff inclusion that the model was not told of."""
+    plt = pyplot()
+    figure, axes = plt.subplots(
+        len(cases), 3, figsize=(13, 2.6 * len(cases)), constrained_layout=True, squeeze=False
+    )
+    for row, case in zip(axes, cases, strict=True):
+        places = np.array(case["middles_mm"])
+        truth, mean = (np.array(case[n]) for n in ("truth_log_kpa", "mean_log_kpa"))
+        most = float(np.exp(max(truth.max(), mean.max())))
+        share = f"{100 * case['inside']:.0f} % of elements inside"
+        for axis, values, words, top in (
+            (row[0], np.exp(truth), "truth, shear stiffness (kPa)", most),
+            (row[1], np.exp(mean), f"mean; {share}", most),
+            (row[2], np.array(case["sd"]), "sd of its logarithm", 1.0),
+        ):
+            dots = axis.scatter(*places.T, c=values, s=12, cmap="viridis", vmin=0.0, vmax=top)
+            axis.set(aspect="equal", title=words, xlabel="x (mm)", ylabel="y (mm)")
+            figure.colorbar(dots, ax=axis, shrink=0.8)
+    save(figure, path, dpi=70)

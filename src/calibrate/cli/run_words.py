@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 NoiseWord = float | dict[str, Any]
 
 MODEL = (
-    "data", "truth", "known", "observe", "prior", "bounded", "noise", "noise_scale", "discrepancy",
+    "data", "truth", "known", "observe", "prior", "bounded", "noise", "noise_scale",
     "check_scale", "forward", "emulator", "error_runs", "mesh_error_runs", "load_steps",
 )  # fmt: skip
 """Fields of a run that say which posterior is meant, besides its scene (:func:`add_scene`) and the
@@ -150,16 +150,6 @@ def noise_scale_words(words: Sequence[str]) -> dict[str, float] | float:
     return _by_name(words, "--noise-scale", float)
 
 
-def discrepancy_words(words: Sequence[str]) -> dict[str, dict[str, float]] | float:
-    """Read ``--discrepancy``: scale and correlation length, ``SCALE:LENGTH``, by name."""
-
-    def read(text: str) -> dict[str, float]:
-        scale, length = map(float, text.split(":"))
-        return {"scale": scale, "length": length}
-
-    return _by_name(words, "--discrepancy", read, bare=False)
-
-
 def _by_name[T](
     words: Sequence[str], option: str, read: Callable[[str], T], *, bare: bool = True
 ) -> dict[str, T] | float:
@@ -240,12 +230,6 @@ WORDS = {
         "[NAME=]SCALE",
         "infer the noise: scale of the half-normal prior of its standard deviation",
         read=noise_scale_words,
-    ),
-    "discrepancy": Word(
-        "NAME=SCALE:LENGTH",
-        "let the model be wrong, e.g. displacement=0.5:20: scale of the half-normal prior of the "
-        "discrepancy's standard deviation, in the data's unit, and its correlation length, mm",
-        read=discrepancy_words,
     ),
     "check_scale": Word(
         flag="--no-unit-check",

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from calibrate.noise.correlated import CorrelatedNoise
-from calibrate.noise.discrepancy import DiscrepancyNoise, with_discrepancy
 from calibrate.noise.gaussian import GaussianNoise
 from calibrate.noise.protocol import Noise, Sites, information_about_means
 from calibrate.noise.student_t import StudentTNoise
@@ -14,13 +13,12 @@ from emulator.core import schema
 from emulator.core.errors import InputError
 
 NOISES: dict[str, type[Noise]] = {
-    kind.kind: kind for kind in (GaussianNoise, StudentTNoise, CorrelatedNoise, DiscrepancyNoise)
+    kind.kind: kind for kind in (GaussianNoise, StudentTNoise, CorrelatedNoise)
 }
 
 __all__ = [
     "NOISES",
     "CorrelatedNoise",
-    "DiscrepancyNoise",
     "GaussianNoise",
     "Noise",
     "Sites",
@@ -28,7 +26,6 @@ __all__ = [
     "information_about_means",
     "noise_of",
     "parse_noise",
-    "with_discrepancy",
 ]
 
 

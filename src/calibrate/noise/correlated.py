@@ -1,7 +1,8 @@
 r"""Gaussian noise of which a part correlates in space, at the cost of a rotation.
 
-Registration and tracking err alike in neighbouring points. Data with independent errors and a
-Gaussian process over reference positions have the covariance
+Registration and tracking err alike in neighbouring points, and a model that is wrong is wrong alike
+in them. Data with independent errors and a Gaussian process over reference positions have the
+covariance
 
 .. math:: C = \sigma^2 I + \omega^2 K, \qquad K_{jk} = k(|X_j - X_k| / \ell), \quad k(0) = 1.
 
@@ -21,13 +22,17 @@ factorisation (Sundararajan and Keerthi 2001; Bürkner, Gabry and Vehtari 2021).
 .. math:: \log p(y_j \mid y_{-j}) = -\tfrac12 \log 2\pi + \tfrac12 \log c_j
           - \tfrac12\, a_j^2 / c_j .
 
+Where the process is the discrepancy of a model (Kennedy and O'Hagan 2001, Equation 5, with scale
+factor 1), its sd is inferred. Data alone cannot tell a discrepancy from a change of theta that
+looks the same (Brynjarsdóttir and O'Hagan 2014): a mean of zero and a length that is given keep it
+from taking all shapes and sizes. The posterior of theta widens; it does not become right by itself.
+
 Components of a vector or tensor do not correlate with one another; each has a K of its own, at the
 positions where it was measured. The kernels k are those of :mod:`emulator.core.gaussian_process`.
 """
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
@@ -140,23 +145,29 @@ class SpatialNormal(dist.Distribution):
         return each.reshape(self.centre.shape)
 
 
-class SpatialNoise(Noise):
-    r"""Noise of covariance :math:`\sigma^2 I + \omega^2 K`; subclasses say what correlates.
+@dataclass(frozen=True)
+class CorrelatedNoise(Noise):
+    r"""Noise of covariance :math:`\sigma^2 I + \omega^2 K`, in the observation's unit.
 
     length : the known correlation length over reference positions, mm.
     sd, sd_scale : the standard deviation of the independent part, or the scale of its half-normal
         prior.
+    spatial_sd, spatial_sd_scale : the same for the part that correlates.
     kernel : the kernel, a name of :data:`emulator.core.gaussian_process.CORRELATIONS`.
     sites : the sites at which the data was measured; a model sets them.
     """
 
-    independent: ClassVar[bool] = False
-
     length: float
-    sd: float | None
-    sd_scale: float | None
-    kernel: str
-    sites: Sites | None
+    sd: float | None = None
+    sd_scale: float | None = None
+    spatial_sd: float | None = None
+    spatial_sd_scale: float | None = None
+    kernel: str = "matern32"
+    sites: Sites | None = field(default=None, compare=False, repr=False)
+
+    kind: ClassVar[str] = "correlated"
+    usage: ClassVar[str] = "correlated:length=MM,sd=SD,spatial_sd=SD"
+    independent: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         check_positive("correlation length (mm)", self.length)
@@ -164,9 +175,10 @@ class SpatialNoise(Noise):
         super().__post_init__()
 
     @property
-    @abstractmethod
     def spatial(self) -> Scale:
-        """Standard deviation omega of the part that correlates."""
+        """Standard deviation of the part that correlates."""
+        options = ("spatial_sd", "spatial_sd_scale")
+        return Scale("spatial_sd", options, self.spatial_sd, self.spatial_sd_scale)
 
     @property
     def scales(self) -> tuple[Scale, ...]:
@@ -186,7 +198,7 @@ class SpatialNoise(Noise):
 
     def at(self, sites: Sites | None) -> Self:
         """Return the noise of data measured at ``sites``; :class:`InputError` without sites."""
-        bound = replace(self, sites=sites)  # type: ignore[type-var]
+        bound = replace(self, sites=sites)
         bound.modes  # noqa: B018 - computed once, and refused here without sites
         return bound
 
@@ -195,31 +207,6 @@ class SpatialNoise(Noise):
         independent, spatial = (scale.value(values) for scale in self.scales)
         variances = independent**2 + spatial**2 * self.modes.eigenvalues
         return SpatialNormal(self.modes, mean, jnp.sqrt(variances))
-
-
-@dataclass(frozen=True)
-class CorrelatedNoise(SpatialNoise):
-    """Independent noise and noise that correlates over ``length``, in the observation's unit.
-
-    spatial_sd, spatial_sd_scale : the same for the part that correlates.
-    """
-
-    length: float
-    sd: float | None = None
-    sd_scale: float | None = None
-    spatial_sd: float | None = None
-    spatial_sd_scale: float | None = None
-    kernel: str = "matern32"
-    sites: Sites | None = field(default=None, compare=False, repr=False)
-
-    kind: ClassVar[str] = "correlated"
-    usage: ClassVar[str] = "correlated:length=MM,sd=SD,spatial_sd=SD"
-
-    @property
-    def spatial(self) -> Scale:
-        """Standard deviation of the part that correlates."""
-        options = ("spatial_sd", "spatial_sd_scale")
-        return Scale("spatial_sd", options, self.spatial_sd, self.spatial_sd_scale)
 
     def simulate(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
         """Return noise of data of this shape; :class:`InputError` where an sd is not known."""

@@ -44,7 +44,7 @@ from typing import Annotated, Any, Literal, Union
 from pydantic import Field, create_model
 
 from calibrate.model_error.kinds import SYSTEMATIC_ERRORS
-from calibrate.noise import NOISES, DiscrepancyNoise
+from calibrate.noise import NOISES
 from calibrate.priors.population import BOX, POPULATIONS, Population
 from calibrate.project.members import POPULATION, Members, Shared
 from calibrate.project.problem import Problem, naming, read_problem
@@ -165,11 +165,9 @@ def _entries() -> type[Table]:
         entry = Field(None, ge=option.least, description=option.help, json_schema_extra=shown)
         of_maps[name] = (int, entry)
     named, in_file = Literal[BOX, *POPULATIONS], Annotated[str, Field(pattern=r"\.json$")]
-    discrepancy: Any = create_model("Discrepancy", __base__=table_of(DiscrepancyNoise))
     exact: dict[str, Any] = {
         "prior": Union[named, in_file, table_of(Population)],  # noqa: UP007
         "noise": Mapping[str, float | noise] | float,
-        "discrepancy": dict[str, discrepancy],
         "systematic": dict[str, Annotated[Any, OneOf("kind", SYSTEMATIC_ERRORS)]],
         "forward": Literal[tuple(FORWARD_MAPS)],
         "forward_options": create_model("ForwardOptions", __base__=Table, **of_maps),

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from calibrate.measurements import DISPLACEMENT, Observations
 from calibrate.model_error.kinds import read_systematic
-from calibrate.noise import Noise, noise_of, with_discrepancy
+from calibrate.noise import Noise, noise_of
 from calibrate.priors import Population
 from calibrate.state_names import split
 from calibrate.statistical_model import at_sites
@@ -58,8 +58,6 @@ class Run:
         body where that is less.
     noise_scale : scale of the half-normal prior of a standard deviation that is inferred, by the
         same names; synthetic data then still has the standard deviation of ``noise``.
-    discrepancy : discrepancy of the model (:mod:`calibrate.noise.discrepancy`) by the
-        observation's name, e.g. ``{"scale": 0.5, "length": 20.0}``; synthetic data has none.
     systematic : errors that several numbers share, by a name of their own, each a kind of
         :data:`calibrate.model_error.kinds.SYSTEMATIC_ERRORS` with its options, e.g.
         ``{"camera": {"kind": "rigid_motion", "of": "displacement", "shift": 2.0, "turn": 1.0}}``;
@@ -94,7 +92,6 @@ class Run:
     bounded: tuple[str, ...] = ()
     noise: Mapping[str, float | dict[str, Any]] | float = field(default_factory=dict)
     noise_scale: Mapping[str, float] | float = field(default_factory=dict)
-    discrepancy: Mapping[str, dict[str, Any]] = field(default_factory=dict)
     systematic: Mapping[str, dict[str, Any]] = field(default_factory=dict)
     check_scale: bool = True
     forward: str = "emulator"
@@ -161,17 +158,14 @@ class Run:
         assert isinstance(run.noise, Mapping)
         assert isinstance(run.noise_scale, Mapping)
         scales = observe.expand(run.noise_scale, "noise-scale")
-        discrepancies = observe.expand(run.discrepancy, "discrepancy")
         noises: dict[str, Noise] = {}
         for name, (source, description) in observe.expand(run.noise, "noise").items():
             scale_source, scale = scales.get(name, (source, None))
-            discrepancy_source, discrepancy = discrepancies.get(name, (source, None))
             # An entry that names one load state gives that state a noise of its own.
-            has_own_noise = name in (source, scale_source, discrepancy_source)
+            has_own_noise = name in (source, scale_source)
             try:
                 noise = noise_of(description)
                 noise = noise if scale is None else noise.inferred(scale)
-                noise = noise if discrepancy is None else with_discrepancy(noise, discrepancy)
             except InputError as error:
                 raise InputError(f"{name} ({observe.parts[name].unit}): {error}") from error
             noises[name if has_own_noise else source] = noise
@@ -179,7 +173,7 @@ class Run:
 
     def synthetic_noise(self, observe: Observations) -> dict[str, Noise]:
         """Return the noise of each observation of synthetic data."""
-        noises = replace(self, noise_scale={}, discrepancy={}).noises(observe)
+        noises = replace(self, noise_scale={}).noises(observe)
         each = {name: noise for name, (_, noise) in observe.expand(noises, "noise").items()}
         return at_sites(each, observe)
 

@@ -12,12 +12,10 @@ from scipy.spatial.distance import cdist
 import calibrate as cal
 from calibrate.noise import (
     CorrelatedNoise,
-    DiscrepancyNoise,
     Sites,
     StudentTNoise,
     noise_of,
     parse_noise,
-    with_discrepancy,
 )
 from emulator.core.errors import InputError
 from emulator.core.gaussian_process import CORRELATIONS
@@ -88,10 +86,7 @@ def test_correlated_noise_is_the_multivariate_normal(kernel, gaps, strict):
     inferred = CorrelatedNoise(12.0, sd_scale=1.0, spatial_sd_scale=1.0, kernel=kernel).at(sites)
     values = {"noise_sd": jnp.asarray(0.3), "spatial_sd": jnp.asarray(0.8)}
     assert set(inferred.priors) == set(values)
-    discrepancy = DiscrepancyNoise(1.0, 12.0, sd=0.3, kernel=kernel).at(sites)
-    by_name = {"discrepancy_sd": jnp.asarray(0.8)}
-    assert set(discrepancy.priors) == set(by_name)
-    for each, numbers in ((noise, {}), (inferred, values), (discrepancy, by_name)):
+    for each, numbers in ((noise, {}), (inferred, values)):
         found = jax.jit(
             lambda y, each=each, v=numbers: each.distribution(jnp.asarray(mean), v).log_prob(y)
         )
@@ -130,9 +125,6 @@ def test_draws_have_the_covariance():
         # The sampling error of a covariance is sqrt((C_jj C_kk + C_jk^2) / count).
         error = np.sqrt((np.outer(np.diag(C), np.diag(C)) + C**2) / count)
         assert np.abs(draws.T @ draws / count - C).max() < 5 * error.max()
-    # A discrepancy is the model's, and the model has made the data.
-    alone = DiscrepancyNoise(5.0, 12.0, sd=0.3).at(sites).simulate(rng, (1000, 3))
-    assert alone.std() == pytest.approx(0.3, rel=0.1)
 
 
 def test_noise_of_a_run_in_words_and_json():
@@ -143,16 +135,12 @@ def test_noise_of_a_run_in_words_and_json():
         "correlated:length=15,sd=0.1,spatial_sd=0.2,kernel=squared_exponential": CorrelatedNoise(
             15.0, 0.1, spatial_sd=0.2, kernel="squared_exponential"
         ),
-        "discrepancy:scale=1,length=20,sd=0.2": DiscrepancyNoise(1.0, 20.0, 0.2),
     }.items():
         assert noise_of(parse_noise(text)) == noise
         assert noise_of(json.loads(json.dumps(noise.to_json()))) == noise
         (inferred,) = {"noise_sd", "noise_scale"} & set(noise.inferred(0.7).priors)
         prior = noise.inferred(0.7).priors[inferred]
         assert float(prior.scale) == 0.7
-    assert with_discrepancy(
-        cal.GaussianNoise(0.2), {"scale": 1.0, "length": 20.0}
-    ) == DiscrepancyNoise(1.0, 20.0, 0.2)
     bound = CorrelatedNoise(15.0, 0.1, spatial_sd=0.2).at(Sites.of(POINTS, 3))
     assert "sites" not in bound.to_json()
 
@@ -172,9 +160,6 @@ def test_noise_of_a_run_in_words_and_json():
             "'rbf' is unknown; known",
         ),
         (lambda: CorrelatedNoise(1.0, 1.0, spatial_sd=1.0).at(None), "has no place of its own"),
-        (lambda: DiscrepancyNoise(0.0, 1.0, 1.0), "standard deviation is 0.0"),
-        (lambda: with_discrepancy(StudentTNoise(4, 1.0), {}), "not to student_t noise"),
-        (lambda: with_discrepancy(cal.GaussianNoise(1.0), {"scale": 1.0}), "'length' is missing"),
         (lambda: parse_noise("loud"), "'loud' is neither a number nor a noise; give gaussian:sd"),
         (lambda: parse_noise("student_t:scale=1"), "noise 'student_t': key 'dof' is missing"),
         (

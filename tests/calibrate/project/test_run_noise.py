@@ -9,10 +9,10 @@ import pytest
 import calibrate as cal
 import emulator as em
 from calibrate.cli.output import posterior_summary
-from calibrate.cli.run_words import discrepancy_words, noise_scale_words, noise_words
+from calibrate.cli.run_words import noise_scale_words, noise_words
 from calibrate.measurements import parse_observation
 from calibrate.measurements.data import write_data
-from calibrate.noise import DiscrepancyNoise, StudentTNoise
+from calibrate.noise import StudentTNoise
 from calibrate.project import Run, infer, make_data, read_posterior, read_problem, report
 from emulator.core import schema
 from emulator.core.errors import InputError
@@ -28,6 +28,9 @@ def run_of(**options):
     return Run("once_clamped_beam", observe="nodes:9+length:3:14", truth=TRUTH, **options)
 
 
+ALIKE = {"kind": "correlated", "length": 20.0, "sd": 0.2, "spatial_sd_scale": 0.5}
+
+
 def test_words_name_noise():
     assert noise_words(["0.3"]) == 0.3
     assert noise_words([]) == {}
@@ -37,9 +40,6 @@ def test_words_name_noise():
         "volume": 1.0,
     }
     assert noise_scale_words(["volume=1"]) == {"volume": 1.0}
-    assert discrepancy_words(["displacement=0.5:20"]) == {
-        "displacement": {"scale": 0.5, "length": 20.0}
-    }
 
 
 def test_a_run_makes_its_noise_from_json(beam, tmp_path):
@@ -58,23 +58,18 @@ def test_a_run_makes_its_noise_from_json(beam, tmp_path):
     assert unknown.synthetic_noise(observe)["displacement"] == StudentTNoise(4, 0.2)
 
 
-def test_a_discrepancy_is_switched_on_by_name(beam):
-    run = run_of(discrepancy={"displacement": {"scale": 0.5, "length": 20.0}})
+def test_a_discrepancy_is_noise_that_correlates_of_an_sd_that_is_inferred(beam):
+    run = run_of(noise={"displacement": ALIKE})
     observe = parse_observation(beam, run.observe)
-    assert run.noises(observe)["displacement"] == DiscrepancyNoise(0.5, 20.0, sd=0.2)
-    assert run.synthetic_noise(observe)["displacement"] == cal.GaussianNoise(sd=0.2)
     model = cal.model(linear_forward(beam), observe, run.noises(observe))
-    assert model.names == ("mu", "lam", "discrepancy_sd_displacement")
-    for options, message in (
-        ({"discrepancy": {"length:3:14": {"scale": 0.5, "length": 20.0}}}, "has no place of its"),
-        (
-            {"discrepancy": {"displacement": {"scale": 0.5}}},
-            "displacement .mm.: .*'length' is miss",
-        ),
-        ({"noise": {"displacement": {"kind": "pink"}}}, "displacement .mm.: noise 'pink' is"),
+    assert model.names == ("mu", "lam", "spatial_sd_displacement")
+    for noise, message in (
+        ({"length:3:14": ALIKE}, "has no place of its"),
+        ({"displacement": {"kind": "correlated", "sd": 0.2}}, "'length' is miss"),
+        ({"displacement": {"kind": "pink"}}, "displacement .mm.: noise 'pink' is"),
     ):
         with pytest.raises(InputError, match=message):
-            cal.model(linear_forward(beam), observe, run_of(**options).noises(observe))
+            cal.model(linear_forward(beam), observe, run_of(noise=noise).noises(observe))
 
 
 def test_synthetic_data_has_the_noise_of_the_run(beam, monkeypatch):
@@ -101,7 +96,7 @@ def test_a_posterior_with_gaps_and_a_discrepancy_is_kept_and_read(tmp_path):
     write_data(tmp_path / "d.csv", observe, data)
     run = Run(
         "once_clamped_beam", data=str(tmp_path / "d.csv"), warmup=50, draws=50, chains=2,
-        discrepancy={"displacement": {"scale": 0.5, "length": 20.0}},
+        noise={"displacement": ALIKE},
     )  # fmt: skip
     posterior = infer(run, tmp_path / "out")
     assert report(run, posterior, None)["missing"] == {"displacement": 4}
@@ -109,10 +104,10 @@ def test_a_posterior_with_gaps_and_a_discrepancy_is_kept_and_read(tmp_path):
         report(run, posterior, None)
     )
     again, back = read_posterior(tmp_path / "out")
-    assert again.noise == {"displacement": 0.2}
+    assert again.noise == {"displacement": ALIKE}
     np.testing.assert_array_equal(back.data["displacement"], values[~np.isnan(values)])
     draw = {name: values[7] for name, values in back.draws().items()}
-    assert "discrepancy_sd" in draw
+    assert "spatial_sd" in draw
     thetas = back.model.states.thetas(draw)
     u = back.model.evaluate(thetas).displacement
     densities = [
@@ -124,14 +119,12 @@ def test_a_posterior_with_gaps_and_a_discrepancy_is_kept_and_read(tmp_path):
 
 def test_what_is_said_of_one_state_makes_its_noise_one_of_its_own(beam):
     observe = parse_observation(beam, "nodes:4", 0, ("soft", "stiff"))
-    discrepancy = {"displacement": {"scale": 0.5, "length": 20.0}}
-    run = run_of(noise=0.3, noise_scale={"displacement@soft": 0.2}, discrepancy=discrepancy)
+    run = run_of(noise=0.3, noise_scale={"displacement@soft": 0.2})
     found = run.noises(observe)
     assert {name: noise.sd for name, noise in found.items()} == {
         "displacement@soft": None,
         "displacement": 0.3,
     }
-    assert all(isinstance(noise, DiscrepancyNoise) for noise in found.values())
 
 
 def test_a_default_is_no_larger_than_the_body_allows_and_said_to_be_that():

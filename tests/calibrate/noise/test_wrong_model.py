@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import calibrate as cal
-from calibrate.noise import with_discrepancy
 from linear_support import LinearForward
 
 TRUTH = jnp.array([75.0, 75.0])
@@ -42,11 +41,11 @@ def test_it_widens_the_posterior_until_it_covers_the_truth(beam, bent):
     forward, data = bent
     observe, noise = cal.nodal_displacements(beam), cal.GaussianNoise(sd=0.1)
     plain = cal.model(forward, observe, noise)
-    honest = cal.model(forward, observe, with_discrepancy(noise, {"scale": 0.5, "length": 50.0}))
-    assert honest.names == ("mu", "lam", "discrepancy_sd")
+    honest = cal.model(forward, observe, cal.CorrelatedNoise(50.0, sd=0.1, spatial_sd_scale=0.5))
+    assert honest.names == ("mu", "lam", "spatial_sd")
     mean, covariance = estimate(plain, data, {})
     assert np.abs(mean - TRUTH).max() > 5.0 * np.sqrt(covariance[0, 0])  # sure, and wrong
-    mean, covariance = estimate(honest, data, {"discrepancy_sd": 0.5})
+    mean, covariance = estimate(honest, data, {"spatial_sd": 0.5})
     assert np.abs(mean - TRUTH).max() < 2.0 * np.sqrt(covariance[0, 0])
     # Generalised least squares by NumPy: (A^T C^-1 A)^-1.
     s = np.sqrt(3.0) * np.linalg.norm(observe.points[:, None] - observe.points, axis=-1) / 50.0
@@ -60,7 +59,7 @@ def test_its_size_is_inferred_and_vanishes_where_the_model_is_right(beam, bent):
     """The profile likelihood of its sd at the estimate of theta: about 0 for data of the model."""
     forward, data = bent
     right = np.asarray(forward(TRUTH)) + np.random.default_rng(1).normal(0.0, 0.1, data.shape)
-    noise = with_discrepancy(cal.GaussianNoise(sd=0.1), {"scale": 0.5, "length": 50.0})
+    noise = cal.CorrelatedNoise(50.0, sd=0.1, spatial_sd_scale=0.5)
     model = cal.model(forward, cal.nodal_displacements(beam), noise)
     sds = np.geomspace(0.003, 3.0, 30)
     best = {}
@@ -68,8 +67,8 @@ def test_its_size_is_inferred_and_vanishes_where_the_model_is_right(beam, bent):
         checked = model.check_data(values)
 
         def density(sd, values=values, checked=checked):
-            theta, _ = estimate(model, values, {"discrepancy_sd": sd})
-            numbers = {"discrepancy_sd": jnp.asarray(sd)}
+            theta, _ = estimate(model, values, {"spatial_sd": sd})
+            numbers = {"spatial_sd": jnp.asarray(sd)}
             u = model.forward(jnp.asarray(theta))[None]
             means = model.observe(u, jnp.asarray(theta)[None])
             return float(model.log_density(numbers, means, checked))
