@@ -144,13 +144,14 @@ class Observations:
 
         forward : the map of all nodes.
         """
-        own: dict[Observation, Callable[[jax.Array], jax.Array]] = {}
-        for part in dict.fromkeys(self.parts.values()):
-            if (told := part.through(forward)) is not None:
-                own[part] = told
-        rest = {name: part for name, part in self.parts.items() if part not in own}
-        others = Observations(rest) if rest else None
-        seen = others._seen(forward.at(others.nodes)) if others is not None else None
+        with jax.ensure_compile_time_eval():  # what is kept must not be traced, if a caller is
+            own: dict[Observation, Callable[[jax.Array], jax.Array]] = {}
+            for part in dict.fromkeys(self.parts.values()):
+                if (told := part.through(forward)) is not None:
+                    own[part] = told
+            rest = {name: part for name, part in self.parts.items() if part not in own}
+            others = Observations(rest) if rest else None
+            seen = others._seen(forward.at(others.nodes)) if others is not None else None
         if seen is not None and not own:
             return seen
         states = () if others is None else others.states

@@ -70,7 +70,7 @@ def test_a_kept_factor_leads_to_the_same_equilibrium(monkeypatch):
 
 def test_a_kept_factor_refuses_what_is_not_definite(ventricle):
     system, scene = ventricle.system, ventricle.scene
-    kept = KeptFactor(system.direct, system.pattern)
+    kept = KeptFactor(system.pattern)
     K = ventricle.tangent(ventricle(scene.centre), scene.centre)
     b = jnp.asarray(np.random.default_rng(0).normal(size=system.pattern.size))
     x, outcome = kept.attempt(K, b)
