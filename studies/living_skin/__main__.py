@@ -74,7 +74,6 @@ def emulated(scene: Scene, folder: Path, runs: int) -> tuple[em.Emulator, Case]:
         "parameters": len(scene.parameters),
         "runs": of["runs"],
         "err_u_mm": of["held_out"]["err_u"],
-        "err_R_N": of["held_out"]["err_R"],
     }
 
 
