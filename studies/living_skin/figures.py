@@ -34,7 +34,7 @@ def draw(cases: dict[str, Case], data: Path, path: Path) -> None:
         error = np.abs(np.stack([mean - high, low - mean]))
         row[1].errorbar(bands.force_amounts, mean, error, fmt="o", label="90 % bands")
         row[1].set(xlabel="motion of the pad (mm)", ylabel="force (mN)", title="force")
-        row[1].legend()
+        row[1].legend(loc="upper left")
         of = cases[f"{skin.name}, map"]
         places = np.array(of["middles_mm"])
         for axis, values, words in (
