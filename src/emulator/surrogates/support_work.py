@@ -29,7 +29,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -45,6 +44,7 @@ from emulator.fem.energy import (
 )
 from emulator.fem.reactions import SupportForce
 from emulator.scenes.scene import Scene
+from emulator.surrogates.protocol import ForwardMap
 
 _PER_PARAMETER = 8  # theta by which points are weighed, for each parameter
 _FEWEST = 48  # theta
@@ -53,29 +53,12 @@ _ROUND_OFF = 1e-9  # of the largest force at a node
 _ALONG = 0.7  # least cosine between the motion and the force's direction
 
 
-class Displacement(Protocol):
-    """A map from theta to displacement that can be restricted to some nodes."""
-
-    @property
-    def nodes(self) -> np.ndarray: ...  # noqa: D102
-
-    def __call__(self, theta: jax.Array) -> jax.Array:
-        """Return the displacement (k, 3) mm at ``theta`` (p,)."""
-        ...
-
-    def at(self, nodes: np.ndarray) -> Displacement:
-        """Return the map of ``nodes`` alone."""
-        ...
-
-
 def amount_of(force: SupportForce) -> str | None:
     """Return the parameter whose change moves the support along the force, and no other support.
 
     None where there is none, or where the body is not in equilibrium as it lies.
     """
     scene = force.scene
-    if not _rests(scene):
-        return None
     own = np.zeros(len(scene.mesh.nodes), dtype=bool)
     own[force.support_nodes] = True
     best, most = None, _ALONG
@@ -86,7 +69,7 @@ def amount_of(force: SupportForce) -> str | None:
         c = moved[own].mean(axis=0)
         if (along := abs(c @ np.asarray(force.direction)) / np.linalg.norm(c)) > most:
             best, most = name, along
-    return best
+    return best if best is not None and _rests(scene) else None
 
 
 def _rests(scene: Scene) -> bool:
@@ -109,7 +92,7 @@ class SupportWork:
     amount : the parameter that moves the support, of :func:`amount_of`.
     """
 
-    forward: Displacement
+    forward: ForwardMap
     force: SupportForce
     amount: str
 
@@ -186,12 +169,12 @@ class _Cells:
     """
 
     scene: Scene
-    forward: Displacement
+    forward: ForwardMap
     points: np.ndarray | None
     springs: tuple[np.ndarray, ...]
 
     @classmethod
-    def of(cls, scene: Scene, forward: Displacement) -> _Cells:
+    def of(cls, scene: Scene, forward: ForwardMap) -> _Cells:
         """Return all of a scene's."""
         springs = tuple(np.arange(len(term.nodes)) for term in spring_terms(scene))
         return cls(scene, forward, None, springs)
