@@ -71,7 +71,7 @@ def test_a_solve_unloads_and_loads(simulator, ventricle):
 @pytest.mark.slow
 def test_at_the_pressure_of_the_image_nothing_moves(simulator, imaged):
     theta = theta_of(0.8, 0.8)
-    at_rest = LoadedEquilibrium(imaged, em.NewtonOptions(), "suitesparse").unloaded(theta)
+    at_rest = LoadedEquilibrium(imaged, em.NewtonOptions()).unloaded(theta)
     still = simulator.solve(theta, at_rest.displacement).require_converged()
     assert float(jnp.abs(still.displacement).max()) < 1e-8
     assert int(still.iterations) > int(at_rest.iterations)  # loaded from rest
@@ -129,7 +129,7 @@ def test_a_campaign_and_emulators(simulator, imaged, tmp_path):
 def test_threads_share_the_recent_shapes(imaged, monkeypatch):
     solves = []
     monkeypatch.setattr(em.Unloader, "solve", lambda _, theta: solves.append(theta) or theta)
-    loaded = LoadedEquilibrium(imaged, em.NewtonOptions(), "suitesparse")
+    loaded = LoadedEquilibrium(imaged, em.NewtonOptions())
     thetas = [theta_of(1.0, 0.3 + 0.01 * k) for k in range(40)]
     with ThreadPoolExecutor(8) as pool:
         shapes = list(pool.map(loaded.unloaded, thetas))
