@@ -319,9 +319,9 @@ def main() -> None:
 
         results.case(f"{skin.name}, map against FEM", against)
         results.case(f"{skin.name}, map", mapped)
-        for which, words in () if quick else _OTHERWISE.items():
+        for which, title in () if quick else _OTHERWISE.items():
             results.case(
-                f"{skin.name}, {words}",
+                f"{skin.name}, {title}",
                 lambda s=skin, w=which, c=chosen, f=frames: told_by(
                     inferred(s, c, f, "laplace", (w,))
                 ),

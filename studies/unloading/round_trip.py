@@ -33,7 +33,7 @@ class Body:
         # Unloads by the pressure that it then loads by, so that nothing should move. One program
         # loads all shapes, from rest.
         own = replace(scene, loaded_by={"pressure": "pressure"}, origin={})
-        self.both = LoadedEquilibrium(own, NewtonOptions(), "suitesparse")
+        self.both = LoadedEquilibrium(own, NewtonOptions())
         jax.block_until_ready(self.both.solve(scene.centre, None).displacement)
         jax.block_until_ready(self.simulator.solve(scene.centre).displacement)
 
