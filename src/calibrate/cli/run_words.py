@@ -151,10 +151,10 @@ def noise_scale_words(words: Sequence[str]) -> dict[str, float] | float:
 
 
 def _by_name[T](
-    words: Sequence[str], option: str, read: Callable[[str], T], *, bare: bool = True
+    words: Sequence[str], option: str, read: Callable[[str], T]
 ) -> dict[str, T] | float:
-    """Read values by name; where a ``bare`` number may stand alone, return it as it is."""
-    if bare and len(words) == 1 and "=" not in words[0]:
+    """Read values by name; return a number that stands alone as it is."""
+    if len(words) == 1 and "=" not in words[0]:
         try:
             return float(words[0])
         except ValueError as error:
@@ -173,8 +173,7 @@ def _by_name[T](
         except InputError as error:
             raise InputError(f"{option}: {error}") from error
         except ValueError as error:
-            right = "volume=1.0" if bare else "displacement=0.5:20"
-            raise InputError(f"{option}: '{word}' is wrong; write it as in {right}") from error
+            raise InputError(f"{option}: '{word}' is wrong; write it as in volume=1.0") from error
     return values
 
 

@@ -256,8 +256,8 @@ class Observation(ABC):
     def through(self, forward: ForwardMap) -> Callable[[jax.Array], jax.Array] | None:
         """Return the data without noise, (*shape), as a function of theta (p,), or None.
 
-        Of a forward map that tells this observation better than its displacement does, which is
-        only nearly in equilibrium; of others it is None.
+        It is not None where the map tells this observation better than its displacement does, which
+        is only nearly in equilibrium.
         """
         return None
 

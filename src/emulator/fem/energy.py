@@ -113,12 +113,17 @@ def with_volume_change(
     return H + stretch * (H + jnp.eye(3, dtype=H.dtype))
 
 
+def mean_change(H: jax.Array, weights: jax.Array, barriers: Barriers | None = None) -> jax.Array:
+    """Return the mean (), by ``weights`` (q,), of J - 1 over the points ``H`` (q, 3, 3)."""
+    J_minus_1 = jax.vmap(lambda h: Strain(h, barriers).J_minus_1)(H)
+    return jnp.vdot(weights, J_minus_1) / jnp.sum(weights)
+
+
 def with_mean_dilatation(
     H: jax.Array, weights: jax.Array, barriers: Barriers | None = None
 ) -> jax.Array:
     """Return the displacement gradients (q, 3, 3) of one block, scaled to the block's mean J."""
-    J_minus_1 = jax.vmap(lambda h: Strain(h, barriers).J_minus_1)(H)
-    change = jnp.vdot(weights, J_minus_1) / jnp.sum(weights)
+    change = mean_change(H, weights, barriers)
     return jax.vmap(lambda h: with_volume_change(h, change, barriers))(H)
 
 
@@ -199,8 +204,7 @@ def block_energies(
     tissue = jax.tree.map(lambda array: array[rows], scene.block_tissue_at(theta))
     change = None
     if scene.dilatation != "pointwise":
-        J_minus_1 = at_points(lambda h: Strain(h).J_minus_1, H)
-        change = jnp.sum(weights * J_minus_1, axis=1, keepdims=True) / weights.sum(1, keepdims=True)
+        change = jax.vmap(mean_change)(H, jnp.asarray(weights))[:, None]
     if points is not None:
         weights, H, tissue = jax.tree.map(partial(one_of_each, points), (weights, H, tissue))
     if change is not None:
