@@ -82,21 +82,6 @@ def many_solves(results):
     assert results["summary"]["solves"] == 3
 
 
-def new_ventricle(results):
-    (case,) = results["cases"]
-    assert case["fem_runs"] == 9
-    assert case["err_V"]["median"] < 0.1
-
-
-def objectives(results):
-    cases = {case["name"]: case for case in results["cases"]}
-    trained = [cases[name] for name in ("simulations", "gradients", "energy", "both")]
-    assert {case["steps"] for case in trained} == {60}
-    assert [case["fem_runs"] for case in trained] == [17, 17, 1, 17]
-    start = cases["the centre's solution"]
-    assert cases["gradients"]["err_F"]["median"] < start["err_F"]["median"]
-
-
 def poor_emulators(results):
     cases = {case["name"]: case for case in results["cases"]}
     taken = cases["coarse, 1 run, 1st order, taken as exact"]
@@ -154,14 +139,6 @@ def stability(results):
     assert results["summary"]["silent_wrong"] == 0
 
 
-def transfer(results):
-    cases = {case["name"]: case for case in results["cases"]}
-    assert len(cases) == 8
-    # Before any step, from scratch is the centre's solution and a transfer is not.
-    scratch, family = (cases[f"from {name}, 0 steps"] for name in ("scratch", "the family"))
-    assert scratch["err_u"]["median"] != family["err_u"]["median"]
-
-
 def silicone_beam(results):
     cases = {case["name"]: case for case in results["cases"]}
     whole, naive = cases["all unknown"], cases["as if nothing were unknown"]
@@ -180,18 +157,17 @@ def verification(results):
     assert 0.0 < case["sd_over_prior"]["mu"] < 0.5
 
 
-def ventricle_family(results):
+def any_ventricle(results):
     (case,) = results["cases"]
-    before, nothing = case["before"], case["one_solution_everywhere"]
-    # By the volume: in displacement these two theta are within 0.1 mm of the centre's solution.
-    assert before["err_V"]["median"] < nothing["err_V"]["median"]
-    assert before["err_u"]["median"] < 0.2 * case["mean_u_mm"]
+    assert case["before"]["err_u"]["median"] < 0.2 * case["mean_u_mm"]
+    assert case["largest_difference_mm"] < 1e-5
 
 
 CHECKS = {
     check.__name__: check
     for check in (
         accuracy_vs_time,
+        any_ventricle,
         certificate,
         decoder_speed,
         effects,
@@ -202,16 +178,12 @@ CHECKS = {
         inverse_benchmark,
         large_meshes,
         many_solves,
-        new_ventricle,
-        objectives,
         poor_emulators,
         published_pressure,
         released_networks,
         sbc,
         sensitivity,
         stability,
-        transfer,
-        ventricle_family,
         silicone_beam,
         verification,
     )

@@ -23,7 +23,7 @@ from cli_support import write_block
 from emulator.core.errors import InputError
 from emulator.surrogates.emulator import SHIPPED
 from emulator.training import recipe
-from emulator.training.graph_network import GraphNetwork
+from emulator.training.paper import Paper
 from emulator.training.plan import Job
 from linear_support import linear_forward
 
@@ -96,8 +96,8 @@ PYTHON = [
     (lambda: Run("liver", data="blanks.csv", truth={"mu": 5.0}), "truth has no effect beside data"),
     (lambda: Run("liver", draws=0), "draws is 0; it must be 1 or more"),
     (lambda: Run("liver", forward_options={"fem_runs": 9}), "no effect without --forward reduced"),
-    (lambda: recipe("luck"), "recipe 'luck' is unknown; known: hybrid"),
-    (lambda: GraphNetwork(steps=0), "steps is 0; it must be 1 or more"),
+    (lambda: recipe("luck"), "recipe 'luck' is unknown; known: mechanics"),
+    (lambda: Paper(steps=0), "steps is 0; it must be 1 or more"),
     (
         lambda: Job(BEAM, budget=1.0),
         "a budget of 1 s: one FEM solution and its compilation alone take",

@@ -57,7 +57,7 @@ class Body:
 
 
 def of_scene(name: str) -> dict[str, str]:
-    """The emulator that is shipped of a scene, and the network of its linear mesh."""
+    """The emulator that is shipped of a scene, and its network."""
     return {"emulator as shipped": name, "network alone": f"{name}_pignn"}
 
 

@@ -58,22 +58,16 @@ def _fem(scene: Scene) -> ForwardMap:
     return fem_forward(Simulator(scene), _series(2)(scene))
 
 
-def _network(scene: Scene) -> ForwardMap:  # noqa: ARG001 - it is shipped
-    return entries.NETWORK()[0]
-
-
 @dataclass(frozen=True)
 class Way:
     """A forward map, made from the scene, and a sampler.
 
     sampler : ``None`` for the toolkit's default, with a certificate after it.
-    before_s : seconds of training what is loaded.
     """
 
     kind: str
     make: Callable[[Scene], ForwardMap]
     sampler: entries.Method | None = NUTS
-    before_s: Callable[[], float] = lambda: 0.0
 
 
 WAYS = {
@@ -88,7 +82,6 @@ WAYS = {
     },
     **{f"POD + GP, {n} FEM runs, NUTS": Way("POD + GP", _reduced(n)) for n in (10, 30, 60)},
     "POD + GP, 60 FEM runs, NumPyro's NUTS": Way("POD + GP", _reduced(60), by_numpyro),
-    "network alone, NUTS": Way("network", _network, before_s=lambda: entries.NETWORK()[1]),
     "series + discrepancy, 20 FEM runs, SMC": Way(
         "emulator", _mechanics(20), entries.sampler("smc")
     ),
@@ -105,7 +98,7 @@ def examine(name: str) -> Case:
     began = time.perf_counter()
     forward = way.make(scene)
     forward(jnp.asarray(scene.centre)).block_until_ready()
-    offline = time.perf_counter() - began + way.before_s()
+    offline = time.perf_counter() - began
     began = time.perf_counter()
     statistical, data, after = model(PROBLEM, forward), data_of(PROBLEM), {}
     if way.sampler:

@@ -138,7 +138,7 @@ def reduced(place: Place) -> Iterator[Rung]:
 
 
 def loaded(place: Place) -> Iterator[Rung]:
-    """What is shipped: the emulator, and the network alone, of linear elements."""
+    """What is shipped: the emulator, and the network alone."""
     for label, name in place.body.shipped.items():
         made = shipped(name)
         kind = "network" if label == NETWORK else "emulator"

@@ -15,7 +15,11 @@ class Made(NamedTuple):
 
 
 def shipped(name: str) -> Made:
-    """The shipped emulator of that name, cached; the run at the centre of the box counts."""
+    """The shipped emulator of that name, cached; the run at the centre of the box counts.
+
+    Sweeps take no FEM run.
+    """
     trained = em.load(name)
-    plan, seconds = trained.record["plan"], trained.record["seconds"]
-    return Made(trained.cache(), float(seconds), plan["simulations"] + 1)
+    record = trained.record
+    runs = 0 if "sweeps" in record else record["plan"]["simulations"] + 1
+    return Made(trained.cache(), float(record["seconds"]), runs)

@@ -8,7 +8,6 @@ accelerator.json; where JAX knows no accelerator the CPU stands alone.
 
 import argparse
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +22,7 @@ from calibrate.samplers.density import density_of
 from calibrate.samplers.smc import SMCOptions
 from calibrate.statistical_model import Data, Model
 from emulator.core.store import write_json
-from emulator.training.graph_network import PAPER
-from emulator.training.optimiser import Steps
+from emulator.training.paper import Paper
 from emulator.training.plan import Job
 
 HERE = Path(__file__).parent
@@ -54,17 +52,16 @@ def particles(model: Model, data: dict[str, Any], size: int) -> dict[str, Any]:
 
 def step_s(device: jax.Device, batch: int, steps: int) -> float:
     """Seconds of a step of the paper's training, ``batch`` theta each, prepared on the CPU."""
-    plan = replace(PAPER, steps=steps, batch=batch)
+    plan = Paper(steps=steps, batch=batch)
     with jax.default_device(jax.devices("cpu")[0]):
         training = plan.prepare(Job(em.load("left_ventricle").scene)).training
         state = training.initial()
     state = jax.device_put(state, device)
-    advance = Steps(training)
     for _ in range(3):
-        state = advance(state, steps)
+        state = training.advance(state, steps)
     began = time.perf_counter()
     for _ in range(steps):
-        state = advance(jax.block_until_ready(state), steps)
+        state = training.advance(jax.block_until_ready(state), steps)
     jax.block_until_ready(state)
     assert device in jax.tree.leaves(state.weights)[0].devices()
     return (time.perf_counter() - began) / steps

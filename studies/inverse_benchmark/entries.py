@@ -6,7 +6,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -14,10 +14,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from studies.inverse_benchmark.problems import SCENE, Problem, data_of, model, scene_of
+from studies.inverse_benchmark.problems import Problem, data_of, model, scene_of
 
 import calibrate as cal
-import emulator as em
 from calibrate.samplers import density_of, find_sampler
 from calibrate.statistical_model import Model
 from emulator.fem import Simulator, run_campaign, sobol
@@ -32,13 +31,6 @@ GOOD = 200  # of the emulator
 Draws = dict[str, np.ndarray]
 Method = Callable[[Model, Draws], tuple[Draws, int]]
 """``method(model, data)``: draws by name, and FEM solves of the sampler."""
-
-
-@lru_cache
-def shipped(name: str) -> tuple[ForwardMap, float, int]:
-    """A shipped emulator, the seconds of its training, and its FEM runs."""
-    trained = em.load(name)
-    return trained.cache(), trained.record["seconds"], trained.record["plan"]["simulations"] + 1
 
 
 @lru_cache
@@ -132,12 +124,10 @@ class Entry:
 
 _NUTS = {"warmup": 300, "draws": 500, "chains": 4, "rounds": 2}
 EMULATOR = emulator
-NETWORK = partial(shipped, f"{SCENE}_pignn")
 OURS = {
     "emulator_nuts": Entry("emulator, NUTS", EMULATOR, sampler("nuts", **_NUTS)),
     "emulator_laplace": Entry("emulator, Laplace", EMULATOR, sampler("laplace")),
     "emcee": Entry("emulator, emcee", EMULATOR, by_emcee),
-    "network_nuts": Entry("network alone, NUTS", NETWORK, sampler("nuts", **_NUTS)),
     "pod_gp_nuts": Entry(
         f"POD + GP of {RUNS} runs, NUTS", reduced, sampler("nuts", **_NUTS)
     ),

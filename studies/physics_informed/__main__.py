@@ -5,7 +5,6 @@
     python -m studies.physics_informed --minutes 60   # for each network
     python -m studies.physics_informed --ways physics --keep DIR    # networks into DIR
     python -m studies.physics_informed --only beam --ways physics --seed 1    # another beginning
-    python -m studies.physics_informed --only --family 20    # ventricles no network has seen
     python -m studies.physics_informed --only --finer        # the ventricle's next finer mesh
     python -m studies.physics_informed --quick --out DIR  # a coarse beam
 
@@ -23,25 +22,22 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from studies.common.output import Case, Results, parser, save
+from studies.common.twins import twin
 from studies.physics_informed.finer_mesh import WAYS as FINER
 from studies.physics_informed.finer_mesh import on_finer
 from studies.physics_informed.judged import TEST_SEED, errors_of
-from studies.ventricle_family.shapes import ventricles
 
 import calibrate as cal
 import emulator as em
-from calibrate.figures import BLUE, GREEN, ORANGE, PINK, VERMILION, pyplot
-from calibrate.measurements import parse_observation
-from emulator.core.errors import SolverError
+from calibrate.figures import BLUE, GREEN, ORANGE, VERMILION, pyplot
 from emulator.fem import Runs, run_campaign, sobol
 from emulator.scenes import Scene
 from emulator.scenes.loads import PublishedPressure
-from emulator.surrogates import Architecture, Emulator, load, save_emulator
+from emulator.surrogates import Architecture, Emulator, save_emulator
 from emulator.surrogates.taylor import expand
 from emulator.training import recipe, train
-from emulator.training.modal import Modal
+from emulator.training.physics import Physics
 from emulator.training.sweeps import polynomial_part, sweep_box
 
 HERE = Path(__file__).parent
@@ -75,9 +71,6 @@ BODIES: dict[str, Callable[[], Scene]] = {
 PAPER = {"beam": 2.0e-2, "cube": 8.5e-4, "liver": 8.8e-3, "ventricle": 2.8e-2,
          "ventricle, the paper's pressure": 2.8e-2}  # fmt: skip
 SWEEPS, EVERY = 60, 3
-FAMILY_SEED, FAMILY_TESTS = 1, 5
-# None is the network alone; more are asked for where fewer were refused.
-FAMILY_SWEEPS = (0, 16, 60)
 # A posterior's landmarks, their sd by the mean displacement, a volume's in mL; FEM runs of its
 # certificate.
 LANDMARKS, NOISE, VOLUME_NOISE, CERTIFIED = 24, 0.03, 1.0, 100
@@ -86,9 +79,8 @@ COLOURS = {
     "sweeps about the centre": GREEN,
     "physics": ORANGE,
     "paper's recipe": VERMILION,
-    "modal": PINK,
 }
-NETWORKS = {"physics": "physics", "paper's recipe": "paper", "modal": "modal"}
+NETWORKS = {"physics": "physics", "paper's recipe": "paper"}
 SMALL = Architecture(
     steps=2, latent=8, hidden=(16, 16), decoder="separable", modes=6, trunk=(16, 40)
 )
@@ -98,13 +90,14 @@ def sweeping(scene: Scene, known: Runs, sweeps: int, *, centre: bool = False) ->
     """Sweeps, a few at a time; with ``centre``, from FEM's series about the centre."""
     simulator = em.Simulator(scene)
     began = time.perf_counter()
-    start = expand(simulator, order=3) if centre else None
+    series = expand(simulator, order=3) if centre else None
+    starts = [] if series is None else [lambda: series]
     seconds, curve = time.perf_counter() - began, []
     with tempfile.TemporaryDirectory() as folder:
         for count in range(16, sweeps + 1, EVERY):
             began = time.perf_counter()
             try:
-                state = sweep_box(simulator, count, SEED, start=start, folder=Path(folder))
+                state = sweep_box(simulator, count, SEED, starts=starts, folder=Path(folder))
             except em.SolverError:  # not yet at the whole load
                 seconds += time.perf_counter() - began
                 continue
@@ -135,17 +128,14 @@ def posterior(emulator: Emulator, known: Runs) -> Case:
     """Data that FEM makes at one held-out theta, their posterior, and what the certificate says."""
     scene = emulator.scene
     words = f"landmarks:{LANDMARKS}" + "+volume" * ("endocardium" in scene.mesh.facet_sets)
-    observe = parse_observation(scene, words)
     sd = {"displacement": NOISE * mean_move(known), "volume": VOLUME_NOISE}
-    noises = {name: cal.GaussianNoise(sd[name]) for name in observe.parts}
-    model = cal.model(emulator.cache(), observe, noises)
     theta = known.theta[0]
-    exact = observe(known.displacement[:1, observe.nodes], theta[None])
-    rng = np.random.default_rng(TEST_SEED)
-    data = {n: np.asarray(v) + sd[n] * rng.normal(size=v.shape) for n, v in exact.items()}
+    observe, noises, data = twin(scene, words, sd, theta, known.displacement[0], TEST_SEED)
+    model = cal.model(emulator.cache(), observe, noises)
     found = cal.sample(model, data, seed=SEED, predictions=False)
     certificate = cal.certify(found, em.Simulator(scene), draws=CERTIFIED, seed=SEED)
     names, table = scene.parameter_names, found.summary()
+    sd = {name: sd[name] for name in noises}
     return {"noise": sd, "truth": dict(zip(names, map(float, theta), strict=True)),
             "summary": {n: {k: row[k] for k in ("mean", "sd")} for n, row in table.items()},
             "verdict": certificate.verdict, "reason": certificate.reason}  # fmt: skip
@@ -155,9 +145,9 @@ def network(scene: Scene, known: Runs, name: str, keep: Path | None, given: Any)
     """The network that a recipe trains in so many minutes, and a posterior with it."""
     small = given.quick
     plan = replace(recipe(name), seed=given.seed)
-    sizes = SMALL if small and isinstance(plan, Modal) else None
+    sizes = SMALL if small and isinstance(plan, Physics) else None
     if small:
-        plan = plan.with_counts(steps=60, simulations=20, freeze=30, polish=50)
+        plan = plan.with_counts(steps=60, simulations=20, polish=50)
     with tempfile.TemporaryDirectory() as folder:
         budget = None if small else 60.0 * given.minutes
         emulator = train(scene, plan, folder, architecture=sizes, budget=budget)
@@ -168,28 +158,6 @@ def network(scene: Scene, known: Runs, name: str, keep: Path | None, given: Any)
     found = {"fem_solutions": solved, "seed": given.seed, "seconds": record["seconds"],
              "steps": record["plan"]["steps"], "errors": errors_of(emulator, known)}  # fmt: skip
     return found | ({} if small else {"posterior": posterior(emulator, known)})
-
-
-def from_family(shape: dict[str, Any]) -> Case:
-    """Sweeps on a ventricle that the family's network has not seen, from where that says."""
-    scene, learned = em.scenes.left_ventricle(**shape), load("ventricle_family")
-    known = run_campaign(em.Simulator(scene), sobol(scene, FAMILY_TESTS, TEST_SEED))
-    rows = []
-    for sweeps in FAMILY_SWEEPS:
-        with tempfile.TemporaryDirectory() as folder:
-            plan = recipe("family") if not sweeps else replace(recipe("sweeps"), sweeps=sweeps)
-            began = time.perf_counter()
-            try:
-                emulator = train(scene, plan, folder, start=learned)
-            except SolverError as refusal:  # too few sweeps, and told so
-                rows.append({"sweeps": sweeps, "refused": str(refusal)})
-                continue
-            seconds = round(time.perf_counter() - began, 1)
-        rows.append({"sweeps": sweeps, "seconds": seconds, "errors": errors_of(emulator, known)})
-        if sweeps:
-            break
-    jax.clear_caches()
-    return {"nodes": len(scene.mesh.nodes), "fem_solutions": 0, "family": rows}
 
 
 class Body:
@@ -265,7 +233,6 @@ def main() -> None:
     arguments.add_argument("--seed", type=int, default=SEED, help="of the networks")
     arguments.add_argument("--keep", type=Path, help="folder that the networks are written to")
     arguments.add_argument("--tests", type=int, default=50)
-    arguments.add_argument("--family", type=int, default=0, help="unseen ventricles, up to 20")
     arguments.add_argument("--finer", action="store_true", help="to a finer mesh of the ventricle")
     given = arguments.parse_args()
     bodies = BODIES
@@ -281,8 +248,6 @@ def main() -> None:
         for way in given.ways or COLOURS:
             seed = f", seed {given.seed}" if way in NETWORKS and given.seed != SEED else ""
             results.case(f"{name}, {way}{seed}", partial(body.case, way, given))
-    for k, shape in enumerate(ventricles(20, FAMILY_SEED)[: given.family]):
-        results.case(f"unseen ventricle {k}", partial(from_family, shape))
     for way in FINER if given.finer else ():
         results.case(f"finer mesh: {way}", partial(on_finer, way))
     draw([case for case in results.cases if "body" in case], given.out / "physics.png")

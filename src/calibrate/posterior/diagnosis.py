@@ -100,11 +100,13 @@ def map_fault(errors: Mapping[str, float]) -> Fault | None:
 
     errors : the distance of the map's data from FEM's at the draws, in noise sd, by observation.
     """
-    worst = max(errors, key=lambda name: np.nan_to_num(errors[name]), default="")
-    if not (worst and errors[worst] > LARGEST_MAP_ERROR):
+    sizes = {name: np.nan_to_num(size, nan=np.inf, posinf=np.inf) for name, size in errors.items()}
+    worst = max(sizes, key=sizes.__getitem__, default="")
+    if not (worst and sizes[worst] > LARGEST_MAP_ERROR):
         return None
+    size = f"{sizes[worst]:.2g} noise sd" if np.isfinite(sizes[worst]) else "an unknown amount"
     return (
-        f"the forward map misses FEM by {errors[worst]:.2g} noise sd in {worst} at the draws",
+        f"the forward map misses FEM by {size} in {worst} at the draws",
         "infer with --forward corrected (or more of its --steps), or let the map's error widen the "
         "posterior (--error-runs N)",
     )

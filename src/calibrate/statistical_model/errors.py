@@ -208,25 +208,38 @@ def with_error(
 def map_errors(
     model: Model, simulator: Simulator, draws: Mapping[str, np.ndarray]
 ) -> dict[str, float]:
-    """Return the map's errors as of :func:`in_noise_sd`, to first order, without FEM runs.
+    """Return the map's errors as of :func:`in_noise_sd`, to first order.
 
-    draws : draws (s,) by the unknown's name, at a few of which a Newton step is taken.
+    A Newton step at each of a few draws tells them, where its own check accepts it. Where it does
+    at none, one FEM run at a draw does; the errors are infinite where that fails.
+
+    draws : draws (s,) by the unknown's name.
     """
     if simulator.scene.loaded_by:
         return {}  # its equations are of two displacements: at rest, and from there to the mesh
-    step = compiled(partial(newton_distance, simulator.system))
+    distance = compiled(partial(newton_distance, simulator.system))
     observe, predict, means = model.observe, jax.jit(model.full), jax.jit(model.means)
     states, count = len(model.states.states), len(next(iter(draws.values())))
-    errors = []
-    for row in np.linspace(0, count - 1, max(_STEPS // states, 1) + 2)[1:-1].astype(int):
+
+    def by_newton(u: jax.Array, theta: jax.Array) -> jax.Array:
+        step = distance(u, theta)
+        return u - step.error if step.accepted else jnp.full_like(u, jnp.nan)
+
+    def by_fem(u: jax.Array, theta: jax.Array) -> jax.Array:
+        solution = simulator.solve(theta, u)
+        return solution.displacement if solution.converged else jnp.full_like(u, jnp.inf)
+
+    def error_at(row: int, equilibrium: Callable[..., jax.Array]) -> jax.Array:
         thetas = model.states.thetas({name: values[row] for name, values in draws.items()})
-        u = jnp.stack([predict(theta) for theta in thetas])
-        off = jnp.stack([step(each, theta).error for each, theta in zip(u, thetas, strict=True)])
-        exact = observe((u - off)[:, observe.nodes], thetas)
+        u = jnp.stack([equilibrium(predict(theta), theta) for theta in thetas])
+        exact = observe(u[:, observe.nodes], thetas)
         seen = means(thetas)[0], exact
-        error = jnp.subtract(*(ravel_pytree(each)[0] for each in seen))
-        errors += [error] if bool(jnp.all(jnp.isfinite(error))) else []
-    return in_noise_sd(model, np.array(errors), draws)
+        return jnp.subtract(*(ravel_pytree(each)[0] for each in seen))
+
+    rows = np.linspace(0, count - 1, max(_STEPS // states, 1) + 2)[1:-1].astype(int)
+    errors = [error_at(row, by_newton) for row in rows]
+    errors = [each for each in errors if jnp.isfinite(each).all()]
+    return in_noise_sd(model, np.array(errors or [error_at(rows[len(rows) // 2], by_fem)]), draws)
 
 
 def noise_sds(model: Model, draws: Mapping[str, np.ndarray]) -> dict[str, float]:

@@ -46,7 +46,7 @@ class Ventricle:
     size : L in mm. axis : (3,) k. cavity, wall : volumes over L^3, which sum to one.
     offset : (n, 3) from the origin, over L. depth : (n,) 0 on the endocardium, 1 outside.
     normal : (n, 3). inner, held : whether nodes are on the endocardium or fixed, (n,) bool.
-    lean : (3,) g, shorter than one; zero in a body of revolution. volume : (n,) nodal, over L^3.
+    lean : (3,) g, shorter than one; zero in a body of revolution.
     """
 
     size: float
@@ -59,7 +59,6 @@ class Ventricle:
     inner: np.ndarray
     held: np.ndarray
     lean: np.ndarray
-    volume: np.ndarray
 
     @property
     def height(self) -> np.ndarray:
@@ -125,7 +124,6 @@ def ventricle(mesh: Mesh, endocardium: str, fixed: np.ndarray) -> Ventricle:
         inner=inner,
         held=fixed,
         lean=centroid / np.hypot(np.linalg.norm(centroid), _SMALL),
-        volume=nodal / size**3,
     )
 
 

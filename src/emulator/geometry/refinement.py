@@ -72,7 +72,7 @@ def unfolded(mesh: Mesh) -> tuple[Mesh, int]:
     A folded element's Jacobian is next to nothing or negative at a node or quadrature point. The
     nodes on its edges are moved halfway to the middles of the edges, as often as it takes.
     """
-    _, slopes = shapes_at(2, np.concatenate([_NODES, quadrature_points(2)]))
+    _, slopes = shapes_at(2, np.concatenate([NODES, quadrature_points(2)]))
     edges, middles = mesh.elements[:, EDGES], mesh.elements[:, 4:]
     chord, share = mesh.nodes.copy(), np.ones((len(mesh.nodes), 1))
     chord[middles] = mesh.nodes[edges].mean(axis=2)
@@ -124,13 +124,13 @@ def corner_parents(mesh: Mesh) -> np.ndarray:
 _CORNERS = ((0, 4, 6, 7), (1, 4, 5, 8), (2, 5, 6, 9), (3, 7, 8, 9))
 _DIAGONALS = (((4, 9), (5, 6, 7, 8)), ((5, 7), (4, 6, 9, 8)), ((6, 8), (4, 5, 9, 7)))
 _FOUR = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))  # of a facet: corners, then 01, 12, 20
-# Barycentric coordinates (10, 4) of a quadratic tetrahedron's nodes.
-_NODES = np.concatenate([np.eye(4), [0.5 * (np.eye(4)[a] + np.eye(4)[b]) for a, b in EDGES]])
+NODES = np.concatenate([np.eye(4), [0.5 * (np.eye(4)[a] + np.eye(4)[b]) for a, b in EDGES]])
+"""Barycentric coordinates (10, 4) of a quadratic tetrahedron's nodes."""
 # Local nodes (3, 8, 4) of the eight children, for each diagonal.
 _AROUND = [[(*ends, ring[k - 1], ring[k]) for k in (1, 2, 3, 0)] for ends, ring in _DIAGONALS]
-_EIGHT = orient(
-    _NODES[:, 1:], np.concatenate([(*_CORNERS, *around) for around in _AROUND])
-).reshape(3, 8, 4)
+_EIGHT = orient(NODES[:, 1:], np.concatenate([(*_CORNERS, *around) for around in _AROUND])).reshape(
+    3, 8, 4
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +182,7 @@ def refined(mesh: Mesh) -> Refinement:
     # The old shape functions at the middle of each new edge, in a child that has it.
     pairs = np.sort(linear.elements[:, EDGES], axis=2).reshape(-1, 2)
     _, first = np.unique(pairs, axis=0, return_index=True)
-    middles = _NODES[children[:, :, EDGES].reshape(-1, 2)[first]].mean(axis=1)
+    middles = NODES[children[:, :, EDGES].reshape(-1, 2)[first]].mean(axis=1)
     values, _ = shapes_at(mesh.order, middles)
     parents = mesh.elements[first // (children.shape[1] * len(EDGES))]
     rows = np.repeat(np.arange(len(first)), values.shape[1])
@@ -190,7 +190,7 @@ def refined(mesh: Mesh) -> Refinement:
     prolongation = vstack([identity(len(mesh.nodes)), new], format="csr")
     prolongation.eliminate_zeros()
     quadratic = to_quadratic(linear, lambda _: new @ mesh.nodes)
-    return Refinement(mesh, quadratic, prolongation, _NODES[children])
+    return Refinement(mesh, quadratic, prolongation, NODES[children])
 
 
 def _shortest_diagonal(mesh: Mesh) -> np.ndarray:

@@ -210,7 +210,7 @@ class CachedEmulator:
             return None
         held = scene.held[self.nodes].ravel()
         free = csr_array(rows.multiply(~held[None]))
-        modes = free @ part.modes.reshape(len(part.modes), -1).T
+        modes = free @ part.modes.reshape(-1, free.shape[1]).T
         prescribed = {
             name: rows @ np.where(held, each[self.nodes].ravel(), 0.0)
             for name, each in scene.prescribed.per_unit.items()
@@ -285,7 +285,8 @@ def load(name: str | Path, scene: Scene | None = None) -> Emulator:
     ----------
     name : one of :func:`shipped`, else a folder written by :func:`save_emulator`; write ``./name``
         for a folder called like a shipped one.
-    scene : the scene it must match; by default the one it was trained for is made again.
+    scene : the scene it must match; by default the one it was trained for is made again. A network
+        that has learned a family of bodies, and stands alone, is taken to the scene's.
 
     Raises
     ------
@@ -308,7 +309,8 @@ def load(name: str | Path, scene: Scene | None = None) -> Emulator:
             )
         kinds = {part: look_up(PARTS, part, f"{file}: part") for part in description["parts"]}
         scene = scene_from_origin(description["scene"]) if scene is None else scene
-        if scene.fingerprint != description["fingerprint"]:
+        other = scene.fingerprint != description["fingerprint"]
+        if other and set(kinds) != {"family"}:  # what was learned on a body stays on it
             raise InputError(
                 f"emulator '{name}' was trained for a scene with fingerprint "
                 f"{description['fingerprint']}; '{scene.name}' has {scene.fingerprint}: train one "
@@ -327,6 +329,8 @@ def load(name: str | Path, scene: Scene | None = None) -> Emulator:
             raise InputError(f"{folder}: its part '{part}' lacks or garbles {error}") from error
         except InputError as error:
             raise InputError(f"{folder}: its part '{part}': {error}") from error
+    if other:
+        parts["family"] = parts["family"].on(scene)
     return Emulator(scene, **parts, record=description.get("record", {}))
 
 

@@ -71,7 +71,6 @@ def released_network(model: str, root: str | Path) -> Emulator:
         space=scene.space,
         graph=graph,
         scale=np.full(3, units(model).length),
-        basis=np.zeros((0, *scene.held.shape), dtype=np.float32),
         theta={"mean": released.mean * unit, "sd": released.sd * unit},
     ).filled(_rename_weights(released, model))
     emulator = Emulator(scene, network=network, record={"released": model})

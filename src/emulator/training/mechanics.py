@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,12 +18,11 @@ from emulator.accuracy.comparison import evaluate
 from emulator.core.errors import InputError
 from emulator.fem import Simulator
 from emulator.fem.campaign import Runs
-from emulator.scenes.scene import all_nodes
+from emulator.scenes.scene import Scene, all_nodes
 from emulator.surrogates.discrepancy import fit_discrepancy
 from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.taylor import Expansion, constant, expand
 from emulator.training.checkpoint import Record, Session
-from emulator.training.family import family_on
 from emulator.training.plan import FEWEST, Job, Plan, check_order, check_runs
 
 _HELD_OUT = 5  # every fifth run is held out
@@ -40,7 +39,6 @@ class DiscrepancyPlan(Plan):
     """
 
     simulations: int = 60
-    needs_slopes: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -78,23 +76,23 @@ class Mechanics(DiscrepancyPlan):
         scene, start = job.scene, job.start
         if start is not None and start.family is None:
             raise InputError(
-                f"recipe '{self.recipe}' trains no network, so it cannot start from that of "
-                f"the emulator of '{start.scene.name}'"
+                f"recipe '{self.recipe}' begins from the network of a family of bodies; the "
+                f"emulator of '{start.scene.name}' has none"
             )
-        family = None if start is None else family_on(start, scene)
-        series, runs = series_and_runs(job, Simulator(scene), self, self.order)
-        rest = series if family is None else series.less(family.cache(all_nodes(scene))).rounded()
-        return Emulator(scene, taylor=rest, family=family), runs, series
+        network = None if start is None or start.family is None else family_on(scene, start)
+        series, runs = _series_and_runs(job, self)
+        if network is None:
+            return Emulator(scene, taylor=series), runs, series
+        return anchored(network, series), runs, series
 
 
-def series_and_runs(
-    job: Job, simulator: Simulator, plan: Plan, order: int
-) -> tuple[Expansion, Runs]:
+def _series_and_runs(job: Job, plan: Mechanics) -> tuple[Expansion, Runs]:
     """Return the series about the centre of the box, rounded as a file stores it, and FEM runs.
 
     The discrepancy model is fitted to the series that is loaded from a file.
     """
-    series = expand(simulator, order=order).rounded() if order else None
+    simulator = Simulator(job.scene)
+    series = expand(simulator, order=plan.order).rounded() if plan.order else None
     if series is not None:
         job.require_time("the series about the centre of the box")
     runs = job.fem_runs(simulator, plan, series, job.deadline(FEM_SHARE))
@@ -109,9 +107,9 @@ def add_discrepancy(
 ) -> tuple[Emulator, dict[str, Any]]:
     """Return ``emulator`` with a discrepancy model of ``runs``, and a record of its choice.
 
-    The model is fitted on top of nothing, of the Taylor series, and of series and network, and the
-    sum with the least error at held-out runs is taken, then fitted to all runs: a network helps
-    where runs are few and harms where they are many. Parts that are not in that sum are dropped.
+    The model is fitted on top of nothing, of the Taylor series, and of a family's network with what
+    the series adds, and the sum with the least error at held-out runs is taken, then fitted to all
+    runs. Parts that are not in that sum are dropped.
 
     emulator : the emulator without a discrepancy model.
     runs : FEM runs with sensitivities.
@@ -158,15 +156,28 @@ def add_discrepancy(
 def _sums(emulator: Emulator, series: Expansion) -> dict[str, Emulator]:
     """Return the sums of parts to which a discrepancy model may be added, by name."""
     bare = replace(emulator, discrepancy=None)
-    nothing = replace(bare, taylor=None, network=None, family=None)
+    nothing = replace(bare, taylor=None, family=None)
     if emulator.coarse is not None:  # the coarse emulator has learned from many runs of this body
         candidates = [bare]
     elif emulator.family is not None:
         series_only = replace(bare, taylor=None)
         candidates = [nothing, replace(nothing, taylor=series), series_only, bare]
     else:
-        candidates = [nothing, replace(bare, network=None), bare]
+        candidates = [nothing, bare]
     return {" + ".join(sum_.parts) or "nothing": sum_ for sum_ in candidates}
+
+
+def family_on(scene: Scene, start: Emulator) -> Emulator:
+    """Return the network of a family in ``start``, alone, on ``scene``."""
+    assert start.family is not None, "the start has a family's network"
+    return Emulator(scene, family=start.family.on(scene))
+
+
+def anchored(network: Emulator, series: Expansion) -> Emulator:
+    """Return the network of a family made to have the derivatives of ``series`` at its centre."""
+    assert network.family is not None, "the network is of a family"
+    own = network.family.cache(all_nodes(network.scene))
+    return replace(network, taylor=series.less(own).rounded())
 
 
 def of_position(emulator: Emulator) -> Callable[[jax.Array], jax.Array]:

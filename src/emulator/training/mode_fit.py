@@ -5,7 +5,7 @@ slopes along the axes of the unit box, which its tangent gives for a tenth of a 
 
 .. math:: d_i = u_i - u_c, \qquad d_{ij} = \sqrt{\gamma}\; \partial u_i / \partial x_j,
 
-in the inner product of the objective ``gradients`` (F-DD),
+in the inner product of displacements and their gradients (the paper's F-DD),
 
 .. math:: \langle v, w \rangle = \frac1{n s^2} \sum_\text{nodes} v \cdot w
     + \frac1{|\Omega| s_F^2} \int_\Omega \nabla v : \nabla w \, dX .
@@ -23,18 +23,21 @@ at fixed w, with K the matrix of the inner product. No theta enters: a step cost
 pass. Steps are as long in every direction of a layer's weights
 (:func:`~emulator.training.optimiser.orthogonal_steps`).
 
-**Coefficients.** The modes are frozen, the snapshots projected on them, and the branch is fitted to
-values and slopes of all runs at once,
+**Coefficients.** The snapshots are projected on the modes, and the branch, :math:`c(x) = h(x) B`
+with h its last hidden layer and a one, is fitted to values and slopes of all runs at once,
 
-.. math:: \frac1c \sum_i \Big[ |c(x_i) - a_i|_G^2
-    + \gamma \sum_j |\partial_j c(x_i) - a_{ij}|_G^2 \Big], \qquad
-    G_{kl} = \langle \varphi_k, \varphi_l \rangle,
+.. math::
+    \min_B \frac1c \sum_i \Big[ |h(x_i) B - a_i|_G^2
+    + \gamma \sum_j |\partial_j h(x_i) B - a_{ij}|_G^2 \Big], \qquad
+    G_{kl} = \langle \varphi_k, \varphi_l \rangle .
 
-by Adam and then by L-BFGS.
+B, which does not depend on G, is solved for at every step as well, and the layers below descend by
+L-BFGS on the logarithm of the misfit.
 """
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, Self
@@ -50,9 +53,10 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from emulator.core.display import counting
 from emulator.fem.campaign import Runs
+from emulator.fem.energy import displacement_gradient
 from emulator.scenes.scene import Scene
 from emulator.surrogates.network import Network
-from emulator.training.objectives import Scales
+from emulator.surrogates.network.pignn import MLP
 from emulator.training.optimiser import Weights
 
 _SLOPES = 0.1  # gamma: positions have a variance of 1/12 in the unit box
@@ -66,15 +70,46 @@ _ROWS = 32  # rows of a block of the product, by trial
 class BranchTargets(NamedTuple):
     """The coefficients to which the branch is fitted.
 
-    modes : the frozen modes, (r, n, 3) in units of the network's scale.
-    values, slopes : the snapshots' coefficients in them, (c, r) and (c, p, r).
+    values, slopes : the snapshots' coefficients in the modes, (c, r) and (c, p, r).
     products : the inner products of the modes, (r, r).
     """
 
-    modes: jax.Array
     values: jax.Array
     slopes: jax.Array
     products: jax.Array
+
+    def misfit(self, found: jax.Array, wanted: jax.Array) -> jax.Array:
+        """Return the square of ``found`` less ``wanted`` (s, r), over that of ``wanted``, ()."""
+        square = lambda e: jnp.sum((e @ self.products) * e)  # noqa: E731
+        return square(found - wanted) / square(wanted)
+
+
+class Scales(NamedTuple):
+    """Root mean squares of what runs differ by from the centre's: s, mm, and s_F, dimensionless."""
+
+    displacement: float
+    gradient: float
+
+
+def scales_of(scene: Scene, runs: Runs) -> Scales:
+    """Return the scales of ``runs``, the one at the centre first."""
+    deviation = np.asarray(runs.displacement[1:] - runs.displacement[0])
+    return Scales(
+        displacement=float(np.sqrt(np.mean(np.sum(deviation**2, axis=-1)))),
+        gradient=float(jnp.sqrt(mean_square_gradient(scene, jnp.asarray(deviation)))),
+    )
+
+
+def mean_square_gradient(scene: Scene, difference: jax.Array) -> jax.Array:
+    """Return the mean over fields and volume of ``|F(u) - F(v)|^2``, ().
+
+    difference : u - v, (b, n, 3) mm. F is linear in the displacement, so that one gradient of the
+        difference is enough.
+    """
+    weights = scene.discretisation.weights
+    H = jax.vmap(lambda d: displacement_gradient(scene, d))(difference)
+    squares = jnp.sum(H * H, axis=(-2, -1))
+    return jnp.sum(weights * jnp.mean(squares, axis=0)) / jnp.sum(weights)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,40 +196,30 @@ class ModeFit:
             targets = self.targets[:, components].reshape(len(H), -1)
             weighted_features = free * self.weighted(features)
             weighted_targets = free * self._weighted_targets[:, components].reshape(len(H), -1)
-            gram = features.T @ weighted_features
-            gram += _RIDGE * jnp.trace(gram) / len(gram) * jnp.eye(len(gram))
-            factor = jax.scipy.linalg.cho_factor(gram)
-            w = jax.scipy.linalg.cho_solve(factor, weighted_features.T @ targets)
+            w = _with_ridge(features.T @ weighted_features, weighted_features.T @ targets)
             weighted_residual = weighted_targets - weighted_features @ w
             misfit += jnp.vdot(targets - features @ w, weighted_residual)
             size += jnp.vdot(targets, weighted_targets)
             derivative -= 2.0 * (weighted_residual @ w.T)
-            W = W.at[:, jnp.array(components)].set(w.reshape(len(gram), len(components), -1))
+            W = W.at[:, jnp.array(components)].set(w.reshape(len(w), len(components), -1))
         return W, misfit / size, derivative / size
 
     def _with_solved_layer(self, weights: Weights) -> Weights:
         return self._with_last_layer(weights, self._project(self._hidden(weights))[0])
 
-    def _with_last_layer(self, weights: Weights, W: jax.Array) -> Weights:
-        network = nnx.merge(self.network.definition, weights)
-        last = network.decoder.trunk.layers[-1]
+    def _with_last_layer(self, weights: Weights, W: jax.Array, *, branch: bool = False) -> Weights:
+        """Return ``weights`` with W (h, ...) as the last layer of the trunk, or of the branch."""
+        own = jax.tree.map(lambda w: w, weights)  # not the caller's variables
+        network = nnx.merge(self.network.definition, own)
+        last = (network.decoder.branch if branch else network.decoder.trunk).layers[-1]
         flat = W.reshape(len(W), -1).astype(jnp.float32)
         last.kernel.set_value(flat[:-1])
         last.bias.set_value(flat[-1])
         return nnx.state(network)
 
-    def descend(
-        self, weights: Weights, number: jax.Array, *frozen: jax.Array
-    ) -> tuple[jax.Array, Weights, Weights]:
-        """Return the misfit, its gradient, and the weights that both belong to.
-
-        frozen : the entries of :class:`BranchTargets`; with them, the misfit is the branch's alone.
-        """
+    def descend(self, weights: Weights, number: jax.Array) -> tuple[jax.Array, Weights, Weights]:
+        """Return the modes' misfit, its gradient, and the weights that both belong to."""
         del number  # every step takes all runs
-        if frozen:
-            targets = BranchTargets(*frozen)
-            value, gradient = jax.value_and_grad(self._branch_misfit)(weights, targets)
-            return value, gradient, weights
         H, back = jax.vjp(self._hidden, weights)
         W, misfit, derivative = self._project(H)
         # The logarithm's gradient keeps its size while the misfit falls by many decades.
@@ -202,9 +227,9 @@ class ModeFit:
         return misfit, gradient, self._with_last_layer(weights, W)
 
     def branch_targets(self, weights: Weights) -> BranchTargets:
-        """Return the modes of ``weights`` and the snapshots' coefficients in them."""
+        """Return the snapshots' coefficients in the modes of ``weights``."""
         deviations, slopes = self._snapshots
-        prepared = jax.jit(lambda w: self.network.prepare(self._with_solved_layer(w))[1])(weights)
+        prepared = jax.jit(lambda w: self.network.prepare(w)[1])(weights)
         free = ~self.scene.held
         modes = np.moveaxis(np.asarray(prepared, dtype=float) * free, 0, -1)  # (n, 3, r)
         weighted = np.asarray(jax.jit(self.weighted)(jnp.asarray(modes)))
@@ -216,37 +241,48 @@ class ModeFit:
         def coefficients(fields: np.ndarray) -> jax.Array:
             right = fields.reshape(-1, len(flat)) @ weighted
             solution = scipy.linalg.solve(safe, right.T, assume_a="pos").T
-            return jnp.asarray(solution.reshape(*fields.shape[:-2], -1), dtype=jnp.float32)
+            return jnp.asarray(solution.reshape(*fields.shape[:-2], -1))
 
-        values, along = coefficients(deviations), coefficients(slopes)
-        return BranchTargets(prepared, values, along, jnp.asarray(products, dtype=jnp.float32))
+        return BranchTargets(coefficients(deviations), coefficients(slopes), jnp.asarray(products))
 
-    def _branch_misfit(self, weights: Weights, targets: BranchTargets) -> jax.Array:
-        """Return the misfit of the coefficients relative to the snapshots', ()."""
-        decoder = nnx.merge(self.network.definition, weights).decoder
+    def _branch_rows(self, branch: MLP, targets: BranchTargets) -> tuple[jax.Array, jax.Array]:
+        """Return h (s, h) and what h B is to be (s, r): values, then slopes by their weight."""
 
-        def branch(position: jax.Array) -> jax.Array:
-            return decoder.branch(self.network.normalise(position))
+        def hidden(position: jax.Array) -> jax.Array:
+            return jnp.append(branch.hidden(self.network.normalise(position)), 1.0)
 
         x = self.scene.to_unit(self.runs.theta)
-        value, slope = jax.vmap(lambda x: (branch(x), jax.jacfwd(branch)(x)))(x)
-        squares = lambda e: jnp.sum((e @ targets.products) * e)  # noqa: E731
-        misfit = squares(value - targets.values)
-        slope_error = jnp.swapaxes(slope, 1, 2).astype(jnp.float32) - targets.slopes
-        misfit += self.slopes * squares(slope_error)
-        return misfit / (squares(targets.values) + self.slopes * squares(targets.slopes))
+        values, slopes = jax.vmap(lambda x: (hidden(x), jax.jacfwd(hidden)(x)))(x)
 
-    def finish(self, iterations: int, weights: Weights, progress: bool) -> Weights:
-        """Return ``weights`` with the last layer solved for and the branch fitted by L-BFGS.
+        def rows(values: jax.Array, slopes: jax.Array) -> jax.Array:
+            flat = slopes.reshape(-1, values.shape[1])
+            return jnp.concatenate([values, np.sqrt(self.slopes) * flat]).astype(float)
 
-        It ends where the misfit no longer falls, by round-off or by a line search that failed.
+        return rows(values, jnp.swapaxes(slopes, 1, 2)), rows(targets.values, targets.slopes)
+
+    def _fit_branch(self, weights: Weights, targets: BranchTargets) -> tuple[jax.Array, jax.Array]:
+        """Return the branch's last layer B (h, r), solved for, and the relative misfit, ().
+
+        The misfit's derivative goes through B: because of the ridge, B is not quite its minimum.
+        """
+        branch = nnx.merge(self.network.definition, weights).decoder.branch
+        features, wanted = self._branch_rows(branch, targets)
+        B = _with_ridge(features.T @ features, features.T @ wanted)
+        return B, targets.misfit(features @ B, wanted)
+
+    def finish(self, iterations: int, deadline: float, weights: Weights, progress: bool) -> Weights:
+        """Return ``weights`` with both last layers solved for and the branch fitted by L-BFGS.
+
+        It ends where the misfit no longer falls, by round-off or by a line search that failed, or
+        at the ``deadline`` on the performance counter.
         """
         weights = jax.jit(self._with_solved_layer)(weights)
         targets = self.branch_targets(weights)
-        branch, rest = nnx.split_state(weights, lambda path, _: "branch" in path, ...)
+        single, rest = nnx.split_state(weights, lambda path, _: "branch" in path, ...)
+        branch = jax.tree.map(lambda w: w.astype(float), single)  # for the line search
 
         def misfit(branch: Any) -> jax.Array:
-            return self._branch_misfit(nnx.merge_state(rest, branch), targets)
+            return jnp.log(self._fit_branch(nnx.merge_state(rest, branch), targets)[1])
 
         solver = optax.lbfgs(memory_size=_MEMORY)
         both = optax.value_and_grad_from_state(misfit)
@@ -270,8 +306,19 @@ class ModeFit:
                     break
                 best_branch, least = carry[0], value
                 bar.update(_AT_ONCE)
-                bar.set_postfix(loss=f"{least:.3e}")
-        return nnx.merge_state(rest, best_branch)
+                bar.set_postfix(misfit=f"{np.exp(least):.3e}")
+                if time.perf_counter() > deadline:
+                    break
+        single = jax.tree.map(lambda w: w.astype(jnp.float32), best_branch)
+        weights = nnx.merge_state(rest, single)
+        B, _ = jax.jit(self._fit_branch)(weights, targets)
+        return self._with_last_layer(weights, B, branch=True)
+
+
+def _with_ridge(gram: jax.Array, right: jax.Array) -> jax.Array:
+    """Return the solution (h, k) of normal equations, ``gram`` (h, h) with a little ridge."""
+    ridge = _RIDGE * jnp.trace(gram) / len(gram) * jnp.eye(len(gram))
+    return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(gram + ridge), right)
 
 
 class BlockedMatrix(NamedTuple):

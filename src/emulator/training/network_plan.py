@@ -1,10 +1,4 @@
-"""What all recipes that train a network share: options, the course of a training, and the start.
-
-Encoders, messages and decoders are shared by all nodes, so that their weights fit any mesh (Dalton
-et al. 2023, Appendix E): a training may start from the weights of another body's network. Series,
-scale and graph belong to one scene and are never carried over. The ranges of the parameters may
-differ, because the network takes positions in the unit box.
-"""
+"""Recipes that train a network share their options and the course of a training."""
 
 from __future__ import annotations
 
@@ -12,20 +6,19 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.fem.campaign import Runs
 from emulator.fem.energy import require_rest
+from emulator.scenes.scene import Scene
 from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.network import fresh
-from emulator.surrogates.network.graph import augment, node_inputs
+from emulator.surrogates.network.graph import augment
 from emulator.surrogates.network.pignn import Architecture
 from emulator.surrogates.taylor import Expansion
 from emulator.training.checkpoint import Record, Session
-from emulator.training.optimiser import NetworkTraining, StepLimit, Steps, run
+from emulator.training.optimiser import NetworkTraining, StepLimit, run
 from emulator.training.plan import Job, Plan
 
 
@@ -73,36 +66,23 @@ class NetworkPlan(Plan):
         """The share of a budget after which the last step ends."""
         return 0.99
 
-    @property
-    def most_steps(self) -> int | None:
-        """The largest number of steps that a budget may lead to; ``None`` for no limit."""
-        return None
-
     def prepare(self, job: Job) -> Problem:
         """Return the FEM runs, and an emulator whose network is untrained."""
         raise NotImplementedError
 
-    def complete(self, emulator: Emulator, problem: Problem) -> tuple[Emulator, Record]:  # noqa: ARG002
-        """Return the emulator with all that follows the network, and entries of the record."""
-        return emulator, {}
-
     def train(self, job: Job, session: Session) -> tuple[Emulator, Record]:
         """Return the trained emulator and its record."""
-        require_rest(job.scene)  # networks learn from the energy there, or have its modes
+        require_rest(job.scene)  # networks learn from the energy there
         problem = self.prepare(job)
-        training, total, limit = problem.training, self.steps, None
-        deadline = job.deadline(self.budget_share)
-        if np.isfinite(deadline):
-            limit = StepLimit(deadline, self.most_steps, training.freeze)
-            total = limit.first_total(training, total)
+        training, deadline = problem.training, job.deadline(self.budget_share)
+        limit = StepLimit(deadline) if np.isfinite(deadline) else None
         architecture = training.network.architecture
         session = replace(session, plan=problem.plan, architecture=architecture)
-        steps, initial = Steps(training), training.initial()
-        state = run(session, initial, total, steps, limit, progress=job.progress)
+        state, advance = training.initial(), training.advance
+        state = run(session, state, self.steps, advance, limit, progress=job.progress)
         record = problem.plan.with_counts(steps=state.done).record(state.loss)
         weights = training.finish(state.weights, job.progress)
-        emulator, more = self.complete(with_weights(problem.emulator, weights), problem)
-        return emulator, {**record, **problem.record, **more}
+        return with_weights(problem.emulator, weights), {**record, **problem.record}
 
 
 def with_weights(emulator: Emulator, weights: Any) -> Emulator:
@@ -111,79 +91,16 @@ def with_weights(emulator: Emulator, weights: Any) -> Emulator:
     return replace(emulator, network=replace(emulator.network, weights=weights))
 
 
-def with_network_of(emulator: Emulator, start: Emulator | None) -> Emulator:
-    """Return ``emulator`` with a copy of the weights of ``start``, if there is one."""
-    if start is None:
-        return emulator
-    assert emulator.network is not None, "only a network has weights"
-    assert start.network is not None, "only a network has weights"
-    copies = jax.tree.map(jnp.copy, jax.tree.leaves(start.network.weights))
-    structure = jax.tree.structure(emulator.network.weights)
-    return with_weights(emulator, jax.tree.unflatten(structure, copies))
-
-
 def untrained(
     plan: Plan,
-    job: Job,
+    scene: Scene,
     series: Expansion | None,
     architecture: Architecture,
     scale: np.ndarray,
-    basis: np.ndarray | None = None,
 ) -> Emulator:
-    """Return the emulator of ``series`` and of a network, with the weights of the start's, if any.
+    """Return the emulator of ``series`` and of a network with weights from the plan's seed.
 
-    scale, basis : as in :class:`~emulator.surrogates.network.Network`.
+    scale : as in :class:`~emulator.surrogates.network.Network`.
     """
-    scene = job.scene
-    network = fresh(scene, augment(scene), architecture, scale, plan.seed, basis)
-    return with_network_of(Emulator(scene, taylor=series, network=network), job.start)
-
-
-def architecture_of(
-    plan: Plan, job: Job, decoder: Any, usual: Architecture = Architecture(), modes: int = 0
-) -> Architecture:
-    """Return the sizes of the network to train: those of the start's network, if there is one.
-
-    decoder : the decoder that the recipe prescribes.
-    usual : the sizes where the job names none.
-    modes : the number of mechanical modes that the decoder is given.
-
-    Raises :class:`InputError`: the start has no network or another architecture, theta or the node
-    features differ, or a decoder's coefficients belong to the mechanical modes of one mesh.
-    """
-    start, scene = job.start, job.scene
-    if start is None:
-        return replace(job.architecture or usual, decoder=decoder)
-    theirs, network = f"the emulator of '{start.scene.name}'", start.network
-    if start.family is not None:
-        raise InputError(
-            f"recipe '{plan.recipe}' cannot start from a network that has learned a family of "
-            "bodies; use recipe family or sweeps, without any FEM run, or mechanics"
-        )
-    if network is None:
-        raise InputError(
-            f"{theirs} has no network to start from, only {' + '.join(start.parts) or 'nothing'}; "
-            "train it with recipe network"
-        )
-    sizes = replace(job.architecture or network.architecture, decoder=decoder)
-    if len(network.basis) or modes:
-        raise InputError(
-            f"starting '{scene.name}' from {theirs}: coefficients of mechanical modes mean nothing "
-            "on another mesh; use a decoder without them, such as recipe network's, for both"
-        )
-    if sizes != network.architecture:
-        raise InputError(
-            f"{theirs} has a network {network.architecture}; '{scene.name}' is to have {sizes}"
-        )
-    if scene.parameter_names != start.scene.parameter_names:
-        raise InputError(
-            f"{theirs} has parameters {', '.join(start.scene.parameter_names)}; "
-            f"'{scene.name}' has {', '.join(scene.parameter_names)}"
-        )
-    width, ours = network.graph.node_features.shape[1], node_inputs(scene).shape[1]
-    if width != ours:
-        raise InputError(
-            f"{theirs} has {width} features a node, '{scene.name}' has {ours}: one has "
-            "supports that move, the other has not"
-        )
-    return sizes
+    network = fresh(scene, augment(scene), architecture, scale, plan.seed)
+    return Emulator(scene, taylor=series, network=network)

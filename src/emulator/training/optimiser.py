@@ -24,14 +24,13 @@ WARMUP = 100  # steps in which the learning rate rises
 _LENGTH = 1.6  # root mean square of an orthogonal step of a weight; Adam's is up to 1
 _SHOW_EVERY = 50  # steps; reading the loss waits for the step to end
 _AIM_EVERY = 200  # steps between two estimates of the remaining time
-_TIMED = 8  # steps that are timed before a training
 
 Weights = nnx.State
 Step = Callable[..., tuple[Weights, Any, jax.Array]]
 Rate = Callable[[jax.Array, jax.Array], jax.Array]
 """``rate(number, total)``: the learning rate of step ``number`` of ``total``."""
 Descent = Callable[..., tuple[jax.Array, Weights, Weights]]
-"""``descend(weights, number, *frozen)``: the loss, its gradient, and the weights both belong to."""
+"""``descend(weights, number, *data)``: the loss, its gradient, and the weights both belong to."""
 Advance = Callable[[State, int], State]
 """One step: from the state and the total number of steps to the next state."""
 
@@ -43,18 +42,6 @@ def cosine(peak: float) -> Rate:
     def rate(number: jax.Array, total: jax.Array) -> jax.Array:
         warm = jnp.minimum(1.0, (number + 1) / WARMUP)
         return peak * warm * 0.5 * (1.0 + jnp.cos(jnp.pi * number / total))
-
-    return rate
-
-
-def two_cosines(peak: float, switch: int) -> Rate:
-    """Return a :func:`cosine` up to step ``switch`` and another one from there on."""
-    one = cosine(peak)
-
-    def rate(number: jax.Array, total: jax.Array) -> jax.Array:
-        later = number >= switch
-        total = jnp.where(later, total - switch, switch)
-        return one(jnp.where(later, number - switch, number), total)
 
     return rate
 
@@ -97,41 +84,26 @@ def in_branch(path: Any) -> bool:
     return "'branch'" in jax.tree_util.keystr(path)
 
 
-def branch_alone(updates: Weights, *frozen: jax.Array) -> Weights:
-    """Return ``updates``; once the modes are ``frozen``, only updates of the branch.
-
-    Adam's momentum would otherwise move the weights that the frozen modes came from.
-    """
-
-    def own(path: Any, update: jax.Array) -> jax.Array:
-        return update if in_branch(path) else jnp.zeros_like(update)
-
-    return jax.tree_util.tree_map_with_path(own, updates) if frozen else updates
-
-
 def make_step(
     rate: Rate,
     descend: Descent,
     optimiser: optax.GradientTransformation,
-    restrict: Callable[..., Weights] = branch_alone,
 ) -> Step:
-    """Return the compiled ``step(weights, state, number, total, *frozen)``.
+    """Return the compiled ``step(weights, state, number, total, *data)``.
 
     It gives the weights, the optimiser's state and the loss. Batch and learning rate follow from
     ``number`` and ``total`` alone, so that a resumed run repeats them. A step whose gradient is not
     finite changes nothing. The step consumes the weights and the state that it is given.
-
-    restrict : the function of the updates and ``*frozen`` to the updates that are made.
     """
 
     def step(
-        weights: Weights, state: Any, number: jax.Array, total: jax.Array, *frozen: Any
+        weights: Weights, state: Any, number: jax.Array, total: jax.Array, *data: Any
     ) -> tuple[Weights, Any, jax.Array]:
-        value, gradient, weights = descend(weights, number, *frozen)
+        value, gradient, weights = descend(weights, number, *data)
         updates, new_state = optimiser.update(gradient, state, weights)
         size = rate(number, total)
         updates = jax.tree.map(lambda d: (-size * d).astype(d.dtype), updates)
-        new = optax.apply_updates(weights, restrict(updates, *frozen)), new_state
+        new = optax.apply_updates(weights, updates), new_state
         finite = jnp.isfinite(optax.tree.norm(gradient))
         weights, state = jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, (weights, state))
         return weights, state, value
@@ -146,9 +118,6 @@ class NetworkTraining:
 
     network : the untrained network.
     optimiser, rate, descend : what its steps are made of (:func:`make_step`).
-    freeze : the step at which the modes of a separable decoder are frozen, so that only its branch
-        is trained from there on; ``None`` for never.
-    frozen : the function from weights to the arrays that later steps take, the modes first.
     finish : from the weights after the last step, and whether to show progress, to the trained
         weights.
     """
@@ -157,8 +126,6 @@ class NetworkTraining:
     optimiser: optax.GradientTransformation
     rate: Rate
     descend: Descent
-    freeze: int | None = None
-    frozen: Callable[[Weights], tuple[jax.Array, ...]] = lambda _: ()
     finish: Callable[[Weights, bool], Weights] = lambda weights, _: weights
 
     @cached_property
@@ -171,26 +138,11 @@ class NetworkTraining:
         weights = jax.tree.map(jnp.copy, self.network.weights)
         return State(weights, self.optimiser.init(weights))
 
-    def advance(self, state: State, total: int, *frozen: jax.Array) -> State:
+    def advance(self, state: State, total: int) -> State:
         """Return the state after the next of ``total`` steps."""
         done, of = jnp.asarray(state.done), jnp.asarray(total)
-        weights, optimiser, loss = self.step(state.weights, state.optimiser, done, of, *frozen)
+        weights, optimiser, loss = self.step(state.weights, state.optimiser, done, of)
         return State(weights, optimiser, state.done + 1, loss)
-
-
-class Steps:
-    """The steps of a network; its frozen modes are computed once."""
-
-    def __init__(self, training: NetworkTraining) -> None:
-        self._training = training
-        self._frozen: tuple[jax.Array, ...] = ()
-
-    def __call__(self, state: State, total: int) -> State:
-        """Return the state after the next step."""
-        freeze = self._training.freeze
-        if freeze is not None and state.done >= freeze and not self._frozen:
-            self._frozen = self._training.frozen(state.weights)
-        return self._training.advance(state, total, *self._frozen)
 
 
 def run(
@@ -227,63 +179,32 @@ def run(
 class StepLimit:
     """Sets the number of steps so that training ends at a deadline.
 
-    A machine becomes busier or less so, and steps become cheaper once the modes are frozen, so the
-    number is estimated again and again.
+    A machine becomes busier or less so, so the number is estimated again and again, from a tenth of
+    the warm-up on.
 
     deadline : the time, on the performance counter, at which the last step should end.
-    most : the largest number of steps; ``None`` for no limit.
-    freeze : the step at which modes are frozen; ``None`` for never.
     """
 
-    def __init__(self, deadline: float, most: int | None = None, freeze: int | None = None) -> None:
+    def __init__(self, deadline: float) -> None:
         self._deadline = deadline
-        self._most = np.iinfo(np.int64).max if most is None else most
-        # The first step after freezing compiles; the clock starts after it.
-        self._restart = -1 if freeze is None else freeze + 1
         self._began, self._first = time.perf_counter(), 0
 
-    def first_total(self, training: NetworkTraining, total: int) -> int:
-        """Return the number of steps to begin with, from a few that are timed and thrown away.
-
-        ``total`` sets the learning rates of the trial. :class:`InputError` where fewer steps fit
-        than a warm-up takes.
-        """
-        seconds = self._deadline - time.perf_counter()
-        start_time = time.perf_counter()
-        one = late = _seconds_a_step(training, total)
-        if training.freeze is not None:
-            late = _seconds_a_step(training, total, *training.frozen(training.initial().weights))
-        remaining = 0.98 * seconds - (time.perf_counter() - start_time)
-        early = remaining / one
-        if training.freeze is not None and late < one:
-            early = min(early, training.freeze)
-        steps = int(early + max(remaining - early * one, 0.0) / late)
-        if steps < WARMUP:
-            raise InputError(
-                f"the budget leaves {max(steps, 0)} training steps of {1e3 * one:.0f} ms after FEM "
-                f"runs and compilation; give at least {WARMUP * one - remaining:.0f} s more"
-            )
-        self._began = time.perf_counter()
-        return min(steps, self._most)
-
     def __call__(self, state: State, total: int) -> int:
-        """Return the number of steps that follows from the time the last ones took."""
-        if state.done == self._restart:
+        """Return the number of steps that follows from the time the last ones took.
+
+        :class:`InputError` where fewer steps fit than a warm-up takes.
+        """
+        if state.done == 1:  # the first step compiles: the clock starts after it
+            jax.block_until_ready(state.loss)
             self._began, self._first = time.perf_counter(), state.done
-        elif state.done % _AIM_EVERY == 0:
+        elif state.done == WARMUP // 10 or state.done % _AIM_EVERY == 0:
             jax.block_until_ready(state.loss)
             now = time.perf_counter()
             one = (now - self._began) / (state.done - self._first)
-            return min(state.done + max(int((self._deadline - now) / one), 0), self._most)
+            total = state.done + max(int((self._deadline - now) / one), 0)
+            if total < WARMUP:
+                raise InputError(
+                    f"the budget leaves {total} training steps of {1e3 * one:.0f} ms after FEM "
+                    f"runs and compilation; give at least {(WARMUP - total) * one:.0f} s more"
+                )
         return total
-
-
-def _seconds_a_step(training: NetworkTraining, total: int, *frozen: jax.Array) -> float:
-    """Return the median seconds of a step, compilation excluded."""
-    state, durations = training.initial(), []
-    for _ in range(_TIMED):
-        begin = time.perf_counter()
-        state = training.advance(state, total, *frozen)
-        state.loss.block_until_ready()
-        durations.append(time.perf_counter() - begin)
-    return float(np.median(durations[1:]))

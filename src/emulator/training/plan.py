@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ import numpy as np
 from emulator.core.errors import InputError, check_seed
 from emulator.fem import Simulator
 from emulator.fem.campaign import Predictor, Runs, StoredRuns, run_campaign
-from emulator.fem.campaign.designs import design, sobol
+from emulator.fem.campaign.designs import design
 from emulator.scenes.scene import Scene
 from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.network.pignn import Architecture
@@ -45,8 +45,6 @@ class Plan:
     recipe: str = ""
     seed: int = 0
     campaign: str = ""
-    needs_slopes: ClassVar[bool] = False
-    """Whether the derivatives of the FEM runs in theta are needed."""
 
     def __post_init__(self) -> None:
         check_seed(self.seed, "training")
@@ -164,12 +162,11 @@ class Job:
         thetas = self.scene.centre[None]
         stored = None if self.campaign is None else _first_runs(self.campaign.runs, plan)
         if stored is None and plan.runs:
-            draw = design if plan.needs_slopes else sobol
-            thetas = jnp.concatenate([thetas, draw(self.scene, plan.runs, plan.seed)])
+            thetas = jnp.concatenate([thetas, design(self.scene, plan.runs, plan.seed)])
         runs = run_campaign(
             simulator,
             thetas,
-            sensitivities=plan.needs_slopes,
+            sensitivities=plan.runs > 0,
             predictor=predictor,
             deadline=deadline,
             at_least=FEWEST + 1,
@@ -181,15 +178,13 @@ class Job:
 
 
 def _first_runs(stored: Runs, plan: Plan) -> Runs:
-    """Return the runs of a campaign that ``plan`` needs, with slopes if it needs them."""
+    """Return the runs of a campaign that ``plan`` needs, with their slopes."""
     if plan.runs > len(stored.theta):
         raise InputError(
             f"training: {plan.runs} simulations of a campaign with {len(stored.theta)} that "
             "converged"
         )
-    if not plan.needs_slopes:
-        stored = stored._replace(sensitivities=None)
-    elif stored.sensitivities is None:
+    if stored.sensitivities is None:
         raise InputError(
             f"training: recipe '{plan.recipe}' needs slopes, which the campaign lacks; make one "
             "with --slopes"

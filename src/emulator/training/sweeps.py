@@ -14,10 +14,12 @@ targets, which no fit has seen, say that it should. At a theta not seen before t
 polynomial's own error to first order, so that every sweep gives an honest error bar, and the sweeps
 end where that is round-off.
 
-The sweeps begin at rest, or under the whole load where the network of a family says, or a series
-about the centre of the box, which is one FEM solution. On a finer mesh they can stand on a map of
-the coarser one: the polynomial is then what that map leaves, which is small and smooth, so that a
-low degree and a few sweeps do.
+The sweeps begin at rest, or under the whole load at a series about the centre of the box, which is
+one FEM solution, or where the network of a family says. Where that is too rough for a tangent to be
+positive definite anywhere, so that no step can be taken, they begin again at the network with the
+same solution and slopes at the centre as FEM. On a finer mesh they can stand on a map of the
+coarser one: the polynomial is then what that map leaves, which is small and smooth, so that a low
+degree and a few sweeps do.
 
 A sweep of c theta costs c/8 factorisations and, for each theta, some six substitutions and
 products. Smooth equilibria are followed to round-off in a few parameters; in five, terms run out.
@@ -26,7 +28,7 @@ products. Smooth equilibria are followed to round-off in a few parameters; in fi
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -58,8 +60,7 @@ from emulator.surrogates.polynomial import (
 )
 from emulator.surrogates.taylor import expand
 from emulator.training.checkpoint import SWEEPS, Record, Session
-from emulator.training.family import family_on
-from emulator.training.mechanics import of_position
+from emulator.training.mechanics import anchored, family_on, of_position
 from emulator.training.plan import Job, Plan, check_order
 from emulator.training.targets import targets
 from emulator.training.two_meshes import on_finer
@@ -92,7 +93,7 @@ class SweepState(NamedTuple):
     gap : the distance to the level of ``before``.
     error, largest_error : the median and the largest step at theta not seen before, mm.
     taken : the part of the last sweep's theta at which a step was taken.
-    lost : whether no step could be taken from the start, so that the sweeps went on from rest.
+    lost : the number of starts that were left because no step could be taken from them.
     """
 
     polynomial: PolynomialFit
@@ -106,7 +107,7 @@ class SweepState(NamedTuple):
     error: float = np.inf
     largest_error: float = np.inf
     taken: float = 0.0
-    lost: bool = False
+    lost: int = 0
 
     @property
     def done(self) -> bool:
@@ -118,7 +119,7 @@ class SweepState(NamedTuple):
         """The entries of an emulator's record."""
         largest = float(self.largest_error)
         entries = {"number": self.number, "error_mm": self.error, "largest_error_mm": largest}
-        return entries | ({"start": "left for rest"} if self.lost else {})
+        return entries | ({"starts_left": self.lost} if self.lost else {})
 
     @property
     def rises(self) -> bool:
@@ -137,7 +138,7 @@ def sweep_box(
     sweeps: int,
     seed: int,
     *,
-    start: Map | None = None,
+    starts: Sequence[Callable[[], Map]] = (),
     beneath: Map | None = None,
     folder: Path | None = None,
     deadline: float = np.inf,
@@ -148,9 +149,9 @@ def sweep_box(
     simulator : the simulator of the scene.
     sweeps : the largest number of sweeps.
     seed : the seed from which the theta are drawn.
-    start : a map to begin at under the whole load; by default sweeps begin at the body at rest, and
-        so they do where no step can be taken from ``start``, because no tangent there is positive
-        definite.
+    starts : makes maps to begin at under the whole load, each where no step could be taken from the
+        one before, because no tangent there is positive definite; after the last, and by default,
+        sweeps begin at the body at rest.
     beneath : a map under the whole load to which the polynomial, at first zero, is added.
     folder : the folder where the state is kept and taken up again.
     deadline : the time, on the performance counter, after which no sweep begins, once the loads are
@@ -160,15 +161,17 @@ def sweep_box(
     Raises :class:`SolverError`: equilibria were not followed up to the loads, or not over the whole
     box.
     """
-    state = _restore(folder) or _initial_state(simulator, start, beneath)
+    state = _restore(folder) or _initial_state(simulator, starts, 0, beneath)
     last_write = time.perf_counter()
     with counting(desc="sweeps", initial=state.number, total=sweeps, disable=not progress) as bar:
         while state.number < sweeps and not state.done:
             if time.perf_counter() > deadline and state.level == 1.0:
                 break
             state, display = _sweep(simulator, state, seed, beneath)
-            if start is not None and state.level == 1.0 and not np.isfinite(state.error):
-                state = _at_rest(simulator)._replace(number=state.number, lost=True)
+            if state.lost < len(starts) and state.level == 1.0 and not np.isfinite(state.error):
+                state = _initial_state(simulator, starts, state.lost + 1)._replace(
+                    number=state.number
+                )
             bar.set_postfix(display)
             bar.update()
             if folder is not None and time.perf_counter() - last_write > _WRITE_EVERY:
@@ -177,7 +180,7 @@ def sweep_box(
     if folder is not None:
         _write(folder, state)
     if state.level < 1.0:
-        cause = "no step could be taken from where the start says, and from rest " * state.lost
+        cause = "no step could be taken from where the start says, and then " * bool(state.lost)
         failure = f"followed the equilibria to {100 * state.level:.0f} % of the loads"
     elif state.taken < _LEAST_SHARE:
         cause = ""
@@ -214,20 +217,31 @@ def _first_degree(parameters: int) -> int:
     return _FIRST_DEGREE if terms(parameters, _FIRST_DEGREE) <= MOST_TERMS else 1
 
 
-def _initial_state(simulator: Simulator, start: Map | None, beneath: Map | None) -> SweepState:
-    """Return the state before the first sweep; its polynomial is fitted to ``start``, if any."""
-    rest = _at_rest(simulator)
+def _initial_state(
+    simulator: Simulator,
+    starts: Sequence[Callable[[], Map]],
+    lost: int,
+    beneath: Map | None = None,
+) -> SweepState:
+    """Return the state before the first sweep; its polynomial is fitted to start ``lost``, if any.
+
+    A start that is not finite, or that FEM finds no solution for, is left for the next.
+    """
+    rest = _at_rest(simulator)._replace(lost=lost)
     if beneath is not None:
         return rest._replace(level=1.0)
-    if start is None:
+    if lost == len(starts):
         return rest
     parameters, degree = rest.values.position.shape[1], rest.polynomial.degree
     if terms(parameters, degree + 1) <= MOST_TERMS:
         degree += 1
     position = np.random.default_rng(0).random((2 * terms(parameters, degree), parameters))
-    fields = _free_fields(simulator, start, position)
+    try:
+        fields = _free_fields(simulator, starts[lost](), position)
+    except SolverError:
+        return _initial_state(simulator, starts, lost + 1)
     if not np.isfinite(fields).all():
-        return rest._replace(lost=True)
+        return _initial_state(simulator, starts, lost + 1)
     polynomial = fit(Samples(position, fields, np.zeros(len(position))), degree, 1.0)
     zeros = 0.0 * polynomial.coefficients
     return rest._replace(polynomial=polynomial, before=zeros, level=1.0)
@@ -342,7 +356,7 @@ class Sweeps(Plan):
     """A polynomial fitted by sweeps over the box.
 
     sweeps : the largest number of sweeps.
-    order : the order of the series at which they begin; 0 for a body at rest.
+    order : the order of the series at which they begin; 0 for a body at rest, or the network.
     """
 
     recipe: str = "sweeps"
@@ -358,13 +372,19 @@ class Sweeps(Plan):
         """Return the emulator and its record."""
         scene, start = job.scene, job.start
         check_sweeps(scene, self.sweeps, at_rest=not self.order and start is None)
-        session.write_plan(self)
         simulator = Simulator(scene)
         emulator = Emulator(scene)
-        beginning: Map | None = None
+        starts: list[Callable[[], Map]] = []
         beneath: Map | None = None
         if start is not None and start.family is not None:
-            beginning = of_position(Emulator(scene, family=family_on(start, scene)))
+            network = family_on(scene, start)
+
+            def at_the_centre() -> Map:
+                return of_position(anchored(network, expand(simulator, order=self.order or 1)))
+
+            starts = (
+                [at_the_centre] if self.order else [lambda: of_position(network), at_the_centre]
+            )
         elif start is not None:
             emulator = on_finer(start, scene, self)
             if self.order:
@@ -374,12 +394,13 @@ class Sweeps(Plan):
                 )
             beneath = of_position(emulator)
         elif self.order:
-            beginning = expand(simulator, order=self.order)
+            starts = [lambda: expand(simulator, order=self.order)]
+        session.write_plan(self)
         state = sweep_box(
             simulator,
             self.sweeps,
             self.seed,
-            start=beginning,
+            starts=starts,
             beneath=beneath,
             folder=job.folder,
             deadline=job.deadline(0.99),
@@ -388,4 +409,5 @@ class Sweeps(Plan):
         plan = self.with_counts(sweeps=state.number)
         session.write_plan(plan)
         emulator = replace(emulator, polynomial=polynomial_part(simulator, state))
-        return emulator, {**plan.record(), "sweeps": state.record}
+        solved = int(state.lost > 0 or self.order > 0) if starts else 0
+        return emulator, {**plan.record(), "sweeps": state.record | {"fem_solutions": solved}}

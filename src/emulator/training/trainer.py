@@ -20,25 +20,19 @@ from emulator.scenes.scene import Scene
 from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.network.pignn import Architecture
 from emulator.training.checkpoint import CHECKPOINT, SWEEPS, Session
-from emulator.training.family import Family
-from emulator.training.graph_network import PAPER, GraphNetwork
-from emulator.training.hybrid import Hybrid
 from emulator.training.mechanics import Mechanics
-from emulator.training.modal import Modal, Physics
+from emulator.training.paper import Paper
+from emulator.training.physics import Physics
 from emulator.training.plan import Job, Plan
 from emulator.training.sweeps import Sweeps
 from emulator.training.two_meshes import TwoMeshes
 
 _ALL: tuple[Plan, ...] = (
-    Hybrid(),
     Mechanics(),
     TwoMeshes(),
-    Family(),
-    GraphNetwork(),
-    Modal(),
     Physics(),
     Sweeps(),
-    PAPER,
+    Paper(),
 )
 RECIPES: dict[str, Plan] = {plan.recipe: plan for plan in _ALL}
 
@@ -75,14 +69,14 @@ def train(
     folder : the folder of the checkpoints. The finished emulator is returned, not written; remove
         the last checkpoint with :func:`remove_checkpoint` once it is safe.
     architecture : the sizes of the network; by default the recipe's.
-    start : the emulator whose network to begin from, which may be of another geometry; of recipe
-        two_meshes, the emulator on the coarser mesh, made by recipe mechanics if none is given.
+    start : the emulator to begin from: of recipes sweeps and mechanics, one with the network of a
+        family of bodies; of sweeps and two_meshes, that on the coarser mesh, which recipe mechanics
+        makes for two_meshes if none is given.
     campaign : FEM runs to take the first ``plan.simulations`` of, instead of making them; needed
         again to resume.
-    budget : seconds for everything (FEM runs, compilation, training, the discrepancy model). It
-        replaces ``plan.steps`` by as many as fit, estimated again as the machine gets busier or
-        less so, and ``plan.simulations`` by as many as were done in its first third. Where a
-        discrepancy model follows, which soon outdoes the network, neither is made larger.
+    budget : seconds for everything (FEM runs, compilation, training). It replaces ``plan.steps`` by
+        as many as fit, estimated again as the machine gets busier or less so, and
+        ``plan.simulations`` by as many as were done in its first third.
     progress : whether progress bars are shown.
     resume : continue from the checkpoint in ``folder``, among sweeps or steps, under the plan it
         was written with and with the network it holds; where no network is trained, ``start`` is
@@ -95,6 +89,11 @@ def train(
         raise InputError(f"training: recipe '{plan.recipe}' takes no FEM runs, so no campaign")
     if architecture is not None and not (plan.trains_network or resume):
         raise InputError(f"training: recipe '{plan.recipe}' trains no network, so no architecture")
+    if start is not None and plan.trains_network:
+        raise InputError(
+            f"training: recipe '{plan.recipe}' trains its network from nothing, so it has no "
+            "start; sweeps and mechanics begin from the network of a family of bodies"
+        )
     session = Session(folder / CHECKPOINT, scene.fingerprint, plan, architecture)
     if resume:
         kinds = {name: type(each) for name, each in RECIPES.items()}
@@ -124,9 +123,7 @@ def _check_same(session: Session, digest: str, start: Mapping[str, Any]) -> None
     if plan.campaign != digest:
         source = "FEM runs of a campaign" if plan.campaign else "FEM runs of its own"
         raise InputError(f"the checkpoint was trained on {source}; resume it with the same")
-    if plan.trains_network and start:
-        raise InputError("the checkpoint has its network's weights; resume it without a start")
-    if not plan.trains_network and session.start != start:
+    if session.start != start:
         raise InputError(
             "the checkpoint stands on another emulator than is given as the start; resume it with "
             "the same"

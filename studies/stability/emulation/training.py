@@ -19,7 +19,7 @@ from emulator.accuracy.estimate import ErrorBar
 from emulator.fem import Simulator, sobol
 from emulator.scenes import Scene
 from emulator.surrogates.emulator import Emulator
-from emulator.training import objectives, recipe, train
+from emulator.training import paper, recipe, train
 
 FAMILY = "training"
 STEPS, TESTS = 60, 4
@@ -41,12 +41,12 @@ def ventricle(exponent: float) -> Scene:
 @contextmanager
 def _without_barriers() -> Iterator[None]:
     """The exact energy in training, as if Eq. 21 to 23 were not there."""
-    kept = objectives.Barriers
-    objectives.Barriers = lambda: None  # type: ignore[assignment]
+    kept = paper.Barriers
+    paper.Barriers = lambda: None  # type: ignore[assignment]
     try:
         yield
     finally:
-        objectives.Barriers = kept
+        paper.Barriers = kept
 
 
 def _trained(rate: float, batch: int, exponent: float, barriers: bool, name: str) -> Ended:

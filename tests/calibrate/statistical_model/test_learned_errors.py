@@ -14,10 +14,13 @@ import calibrate as cal
 import emulator as em
 from calibrate.model_error import ModelError
 from calibrate.posterior import sample
+from calibrate.posterior.diagnosis import map_fault
 from calibrate.statistical_model import with_error
 from calibrate.statistical_model.errors import fit, map_errors
+from emulator.accuracy.estimate import newton_distance
 from emulator.core.errors import InputError
-from emulator.surrogates.taylor import expand
+from emulator.fem.newton import NewtonOptions
+from emulator.surrogates.taylor import constant, expand
 from linear_support import LinearSimulator, closed_form, linear_forward
 
 NODES = np.array([3, 11, 20, 30])
@@ -213,3 +216,21 @@ def test_a_newton_step_tells_what_the_map_misses(beam, simulator, aware):
     model = cal.model(forward, cal.nodal_displacements(beam, NODES), noise)
     inferred = map_errors(model, simulator, draws | {"noise_sd": np.full(20, 0.3 * NOISE)})
     assert inferred["displacement"] == pytest.approx(2.0 * told["displacement"])
+
+
+def test_fem_tells_what_a_map_misses_where_no_newton_step_does(beam, simulator):
+    """A field so rough that its tangent is indefinite, as a network's may be."""
+    theta, observe = beam.centre, cal.nodal_displacements(beam, NODES)
+    u = simulator(theta)
+    rough = jnp.where(beam.held, 0.0, 3.0 * np.random.default_rng(1).normal(size=u.shape))
+    assert not newton_distance(simulator.system, u + rough, theta).accepted
+    forward = em.Emulator(beam, taylor=constant(np.full(len(theta), 0.5), u + rough)).cache()
+    model = cal.model(forward, observe, cal.GaussianNoise(sd=NOISE))
+    values = zip(model.names, theta, strict=True)
+    draws = {name: np.full(20, float(value)) for name, value in values}
+    expected = np.sqrt(np.mean(np.asarray(rough)[NODES] ** 2)) / NOISE
+    told = map_errors(model, simulator, draws)
+    assert told == {"displacement": pytest.approx(expected, rel=1e-6)}
+    lost = em.Simulator(beam, NewtonOptions(max_iterations=1))
+    told = map_errors(model, lost, draws)
+    assert "misses FEM by an unknown amount in displacement" in map_fault(told)[0]

@@ -155,8 +155,7 @@ NEEDING_REST = [
     lambda scene: em.unload(scene, theta_of(1.0, 0.8)),
     lambda scene: em.element_fields(scene, np.zeros(scene.held.shape), theta_of(1.0, 0.8)),
     lambda scene: em.Simulator(scene).reactions(np.zeros(scene.held.shape), theta_of(1.0, 0.8)),
-    lambda scene: em.train(scene, em.recipe("hybrid"), "nowhere"),
-    lambda scene: em.train(scene, em.recipe("modal"), "nowhere"),
+    lambda scene: em.train(scene, em.recipe("physics"), "nowhere"),
     lambda scene: em.train(scene, em.recipe("sweeps"), "nowhere"),
 ]
 

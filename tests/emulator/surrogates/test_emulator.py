@@ -19,7 +19,6 @@ from emulator.surrogates.network import fresh
 from emulator.surrogates.network.graph import AugmentedGraph
 from emulator.surrogates.polynomial import compressed, degrees_up_to
 from emulator.surrogates.taylor import expand
-from emulator.training.hybrid import mechanical_modes
 from network_support import drawn
 
 SMALL = Architecture(steps=1, latent=8, hidden=(16, 16), decoder="separable", modes=3)
@@ -30,11 +29,10 @@ NAMES = tuple(name for name in PARTS if name not in ("family", "coarse"))
 
 @pytest.fixture(scope="module")
 def whole(beam, simulator):
-    """Series of order 2, five mechanical modes, weights drawn, and a discrepancy model over both."""
+    """Series of order 2, weights drawn, and a discrepancy model over both."""
     series = expand(simulator, order=2)
     scale = np.array([0.5, 1.0, 2.0])
-    basis = (mechanical_modes(simulator, series, 5) / scale).astype(np.float32)
-    network = drawn(fresh(beam, augment(beam), SMALL, scale, 0, basis), 0.01)
+    network = drawn(fresh(beam, augment(beam), SMALL, scale, 0), 0.01)
     fields = 0.01 * np.random.default_rng(2).normal(size=(6, *beam.held.shape))
     polynomial = compressed(degrees_up_to(2, 2), fields, 0.0)
     emulator = Emulator(beam, taylor=series, polynomial=polynomial, network=network)

@@ -115,10 +115,10 @@ def test_shipped_emulators_say_how_they_were_made(name):
     assert record["seconds"] > 0
     assert record["hardware"]["cores"]
     if name == FAMILY:
-        assert record["command"].startswith(f"python studies/{FAMILY}/run.py --train")
+        assert record["command"].startswith("python -m studies.any_ventricle --train")
         return
     recipe = (
-        " --recipe modal " if name in ALONE else " --recipe sweeps " if name in PHYSICS else " "
+        " --recipe physics " if name in ALONE else " --recipe sweeps " if name in PHYSICS else " "
     )
     assert record["command"].startswith(f"calibrate train {OF_A_PART.sub('', name)}{recipe}")
 

@@ -12,45 +12,26 @@ from emulator.core.errors import InputError
 from emulator.fem import run_campaign, sobol, uniform
 from emulator.fem.campaign import StoredRuns
 from emulator.geometry.refinement import to_quadratic
-from emulator.surrogates import Architecture, Emulator
+from emulator.surrogates import Architecture
 from emulator.training import recipe, train
 from emulator.training.checkpoint import CHECKPOINT, Session, State
-from emulator.training.graph_network import GraphNetwork
-from emulator.training.hybrid import Hybrid
 from emulator.training.mechanics import Mechanics
-from emulator.training.optimiser import WARMUP
+from emulator.training.optimiser import WARMUP, cosine
+from emulator.training.paper import Paper
+from emulator.training.physics import Physics
 from emulator.training.plan import Job
 
 SMALL = Architecture(steps=2, latent=8, hidden=(16, 16))
+SEPARABLE = replace(SMALL, decoder="separable", modes=6, trunk=(16, 40))
 
 
 @pytest.fixture(scope="module")
 def tests(beam, simulator):
-    return run_campaign(simulator, sobol(beam, 6, seed=5))
-
-
-# Energy alone leaves the soft modes behind and takes longer.
-@pytest.mark.parametrize(
-    ("objective", "factor"),
-    [
-        pytest.param("energy", 0.8, marks=pytest.mark.slow),
-        pytest.param("simulations", 0.5, marks=pytest.mark.slow),
-        pytest.param("gradients", 0.5, marks=pytest.mark.slow),
-        pytest.param("both", 0.5, marks=pytest.mark.slow),
-    ],
-)
-def test_training_lowers_the_error(beam, tests, objective, factor, tmp_path):
-    plan = GraphNetwork(objective=objective, steps=300, simulations=16, batch=8, learning_rate=3e-3)
-    emulator = train(beam, plan, tmp_path, architecture=SMALL)
-    centre = em.Simulator(beam)(beam.centre)
-    before = np.median(np.linalg.norm(tests.displacement - centre, axis=-1))
-    after = evaluate(emulator.cache(), tests.theta, tests.displacement)
-    assert after["err_u"]["median"] < factor * before
-    assert emulator.record["plan"]["objective"] == objective
+    return run_campaign(simulator, sobol(beam, 6, seed=5), sensitivities=True)
 
 
 def test_a_killed_run_resumes_to_the_same_weights(beam, tmp_path, monkeypatch):
-    plan = GraphNetwork(steps=30, simulations=8, batch=4, checkpoint_every=10)
+    plan = Paper(steps=30, batch=4, checkpoint_every=10)
     whole = train(beam, plan, tmp_path / "whole", architecture=SMALL)
 
     write, kept = Session.write, []
@@ -66,7 +47,7 @@ def test_a_killed_run_resumes_to_the_same_weights(beam, tmp_path, monkeypatch):
         train(beam, plan, tmp_path / "killed", architecture=SMALL)
     monkeypatch.setattr(Session, "write", write)
     # The plan comes from the checkpoint, not from the call.
-    resumed = train(beam, GraphNetwork(), tmp_path / "killed", architecture=SMALL, resume=True)
+    resumed = train(beam, Paper(), tmp_path / "killed", architecture=SMALL, resume=True)
     leaves = [jax.tree.leaves(e.network.weights) for e in (whole, resumed)]
     for a, b in zip(*leaves, strict=True):
         np.testing.assert_array_equal(a, b)
@@ -76,8 +57,8 @@ def test_a_killed_run_resumes_to_the_same_weights(beam, tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_resuming_needs_a_checkpoint_of_this_scene(beam, cube, tmp_path):
     with pytest.raises(InputError, match="nothing to resume"):
-        train(beam, GraphNetwork(), tmp_path, resume=True)
-    plan = GraphNetwork(steps=3, simulations=4, batch=2, checkpoint_every=2)
+        train(beam, Paper(), tmp_path, resume=True)
+    plan = Paper(steps=3, batch=2, checkpoint_every=2)
     train(beam, plan, tmp_path, architecture=SMALL)
     with pytest.raises(InputError, match="belongs to another scene than 'twisting_cube'"):
         train(cube, plan, tmp_path, architecture=SMALL, resume=True)
@@ -89,7 +70,7 @@ def test_resuming_needs_a_checkpoint_of_this_scene(beam, cube, tmp_path):
 
 @pytest.mark.slow
 def test_a_step_without_a_finite_gradient_is_not_taken(beam):
-    plan = GraphNetwork(steps=10, simulations=4, batch=2)
+    plan = Paper(steps=10, batch=2)
     problem = plan.prepare(Job(beam, SMALL))
     leaves, structure = jax.tree.flatten(problem.emulator.network.weights)
     leaves[3] = jnp.full_like(leaves[3], jnp.nan)
@@ -104,7 +85,7 @@ def test_a_step_without_a_finite_gradient_is_not_taken(beam):
 
 @pytest.mark.slow
 def test_a_budget_sets_the_number_of_steps(beam, tmp_path):
-    emulator = train(beam, GraphNetwork(simulations=16), tmp_path, architecture=SMALL, budget=25.0)
+    emulator = train(beam, Paper(), tmp_path, architecture=SMALL, budget=25.0)
     assert emulator.record["plan"]["steps"] > WARMUP
     assert emulator.record["seconds"] < 50.0  # whatever else the machine is doing
 
@@ -113,12 +94,10 @@ def test_a_budget_sets_the_number_of_steps(beam, tmp_path):
 def test_a_budget_too_small_says_how_much_more(beam, tmp_path):
     """What 5 s are enough for is the machine's business, and what it has compiled before."""
     with pytest.raises(InputError, match="a budget of 1 s: one FEM solution and its compilation"):
-        train(beam, GraphNetwork(simulations=16), tmp_path, architecture=SMALL, budget=1.0)
+        train(beam, Paper(), tmp_path, architecture=SMALL, budget=1.0)
     over = r"the budget leaves \d+ training steps .* give at least|the budget of 5 s is over after"
     try:
-        emulator = train(
-            beam, GraphNetwork(simulations=16), tmp_path, architecture=SMALL, budget=5.0
-        )
+        emulator = train(beam, Paper(), tmp_path, architecture=SMALL, budget=5.0)
     except InputError as error:
         assert re.search(over, str(error))  # noqa: PT017 - it may also be enough
     else:
@@ -128,27 +107,20 @@ def test_a_budget_too_small_says_how_much_more(beam, tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (
-            {"objective": "luck"},
-            "objective 'luck': use energy, simulations, gradients or both",
-        ),
-        (
-            {"objective": "gradients", "simulations": 4},
-            "4 simulations are fewer than a batch of 16",
-        ),
         ({"steps": 0}, "steps is 0; it must be 1 or more"),
         ({"learning_rate": float("nan")}, "learning_rate is nan; it must be positive and finite"),
         ({"learning_rate": -1e-3}, "learning_rate is -0.001; it must be positive and finite"),
-        ({"simulations": 4}, "4 simulations are fewer than a batch of 16"),
+        ({"simulations": 0}, "0 simulations; modes need 1 or more"),
+        ({"sweeps": -1}, "sweeps is -1; it must be 0 or more"),
     ],
 )
 def test_plans_that_cannot_work(options, message):
     with pytest.raises(InputError, match=message):
-        GraphNetwork(**options)
+        Physics(**options)
 
 
 def test_learning_rate_rises_then_falls():
-    rate = GraphNetwork().rate
+    rate = cosine(1e-3)
     rates = np.array([rate(jnp.asarray(k), jnp.asarray(1000)) for k in range(1000)])
     assert rates[0] == pytest.approx(1e-3 / WARMUP)
     assert 90 < rates.argmax() < 110
@@ -166,97 +138,28 @@ def test_samples_fill_the_box(beam):
     np.testing.assert_array_equal(sobol(beam, 5, 3), sobol(beam, 8, 3)[:5])
 
 
-HYBRID = Hybrid(
-    order=2,
-    simulations=11,
-    steps=30,
-    freeze=10,
-    batch=4,
-    modes=4,
-    checkpoint_every=8,
-)
-
-
-@pytest.fixture(scope="module")
-def hybrid(beam, tmp_path_factory):
-    return train(beam, HYBRID, tmp_path_factory.mktemp("hybrid"), architecture=SMALL)
-
-
-@pytest.mark.slow
-def test_a_hybrid_is_far_better_than_its_series(beam, tests, hybrid):
-    series = Emulator(beam, taylor=Mechanics(order=2, simulations=1).prepare(Job(beam))[2])
-    before, after = (
-        evaluate(e.cache(), tests.theta, tests.displacement)["err_u"]["median"]
-        for e in (series, hybrid)
-    )
-    assert after < 0.05 * before
-    chosen = hybrid.record["discrepancy"]
-    assert chosen["runs"] == 12
-    errors = chosen["held_out_err_u_mm"]
-    assert list(errors) == ["nothing", "taylor", "taylor + network"]
-    assert chosen["on"] == min(errors, key=errors.get)
-    on = [] if chosen["on"] == "nothing" else chosen["on"].split(" + ")
-    assert [*on, "discrepancy"] == list(hybrid.parts)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("writes", [3, 5])
-def test_a_hybrid_killed_anywhere_resumes_to_the_same(beam, tmp_path, monkeypatch, hybrid, writes):
-    """After its modes are frozen, and while the discrepancy model is fitted."""
-    write, kept = Session.write, []
-
-    def killed(*arguments):
-        write(*arguments)
-        kept.append(arguments)
-        if len(kept) == writes:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(Session, "write", killed)
-    with pytest.raises(KeyboardInterrupt):
-        train(beam, HYBRID, tmp_path, architecture=SMALL)
-    monkeypatch.setattr(Session, "write", write)
-    resumed = train(beam, GraphNetwork(), tmp_path, architecture=SMALL, resume=True)
-    assert resumed.fingerprint == hybrid.fingerprint
-    assert resumed.record["plan"] == hybrid.record["plan"]
-
-
-@pytest.mark.slow
-def test_frozen_modes_do_not_move(beam):
-    problem = HYBRID.prepare(Job(beam, SMALL))
-    weights, state, *_ = problem.training.initial()
-    number, total = jnp.asarray(0), jnp.asarray(30)
-    for _ in range(2):  # momentum that would move them
-        weights, state, _ = problem.training.step(weights, state, number, total)
-    kept = problem.emulator.network.prepare(weights)[1]
-    before = jax.tree.map(np.array, weights)
-    weights, state, _ = problem.training.step(weights, state, number, total, kept)
-    moved = {
-        jax.tree_util.keystr(path)
-        for (path, a), b in zip(
-            jax.tree_util.tree_leaves_with_path(before), jax.tree.leaves(weights), strict=True
-        )
-        if not np.array_equal(a, b)
-    }
-    assert moved
-    assert all("branch" in name for name in moved)
-    np.testing.assert_array_equal(problem.emulator.network.prepare(weights)[1], kept)
-
-
-def test_the_papers_recipe_is_the_papers():
-    plan = recipe("paper")
-    assert (plan.objective, plan.batch, plan.centred) == ("energy", 1, False)
-    rates = [float(plan.rate(jnp.asarray(k), jnp.asarray(100))) for k in (0, 49, 50, 99)]
-    assert rates == pytest.approx([1e-4, 1e-4, 1e-5, 1e-5])
-    with pytest.raises(
-        InputError, match="recipe 'quick' is unknown; known: hybrid, mechanics, two_meshes, fam"
-    ):
+def test_a_recipe_that_is_unknown():
+    known = "mechanics, two_meshes, physics, sweeps, paper"
+    with pytest.raises(InputError, match=f"recipe 'quick' is unknown; known: {known}"):
         recipe("quick")
 
 
+def test_what_a_recipe_has_no_use_for(beam, tmp_path):
+    for name in ("mechanics", "two_meshes", "sweeps"):
+        with pytest.raises(InputError, match=f"recipe '{name}' trains no network, so no archit"):
+            train(beam, recipe(name), tmp_path, architecture=SMALL)
+    start = em.load("once_clamped_beam")
+    for name in ("physics", "paper"):
+        with pytest.raises(InputError, match="trains its network from nothing, so it has no start"):
+            train(beam, recipe(name), tmp_path, start=start)
+    with pytest.raises(InputError, match="recipe 'mechanics' begins from .* has none"):
+        train(beam, recipe("mechanics"), tmp_path, start=start)
+    assert not (tmp_path / CHECKPOINT).exists()
+
+
 def test_orders_of_a_series():
-    for kind in (Hybrid, Mechanics):
-        with pytest.raises(InputError, match="series of order 5; give 0 to 4"):
-            kind(order=5)
+    with pytest.raises(InputError, match="series of order 5; give 0 to 4"):
+        Mechanics(order=5)
 
 
 @pytest.mark.slow
@@ -273,7 +176,7 @@ def test_mechanics_builds_no_network(beam, tests, tmp_path, monkeypatch):
     report = evaluate(emulator.cache(), tests.theta, tests.displacement)
     assert report["err_u"]["median"] < 1e-2
     assert emulator.record["final_loss"] is None
-    assert train(beam, GraphNetwork(), tmp_path, resume=True).fingerprint == emulator.fingerprint
+    assert train(beam, Paper(), tmp_path, resume=True).fingerprint == emulator.fingerprint
 
 
 @pytest.mark.slow
@@ -288,24 +191,8 @@ def test_mechanics_on_a_quadratic_ventricle(tmp_path):
     assert report["err_u"]["median"] < 0.02 * report["max_u"]["median"]
 
 
-@pytest.mark.slow
-def test_a_network_on_a_quadratic_mesh(tmp_path):
-    """Energy lowers from the centre's solution on."""
-    linear = em.scenes.once_clamped_beam(cells=(2, 1, 1), order=1)
-    scene = replace(linear, mesh=to_quadratic(linear.mesh), origin={})
-    emulator = train(
-        scene, GraphNetwork(objective="energy", steps=20, batch=4), tmp_path, architecture=SMALL
-    )
-    assert emulator.network.graph.real == len(scene.mesh.nodes)
-    thetas = uniform(scene, 16, jax.random.key(1))
-    Pi = jax.vmap(em.potential_energy(scene))
-    before = replace(emulator, network=None)
-    trained, untrained = (float(Pi(e.cache()(thetas), thetas).mean()) for e in (emulator, before))
-    assert trained < untrained
-
-
 def test_an_aim_follows_the_clock(monkeypatch):
-    """Steps of 1 s against a deadline in 1000 s, then of 2 s; no more than the plan's."""
+    """Steps of 1 s against a deadline in 1000 s, then of 2 s."""
     from emulator.training import optimiser as module
 
     now = [0.0]
@@ -317,29 +204,32 @@ def test_an_aim_follows_the_clock(monkeypatch):
     assert aim(State({}, (), 400, 0.0), 1000) == 400 + int(400.0 / 1.5)
     assert aim(State({}, (), 401, 0.0), 666) == 666
     now[0] = 0.0
-    late = module.StepLimit(100.0, most=300)
+    late = module.StepLimit(100.0)
     now[0] = 200.0  # past the deadline: no step more
     assert late(State({}, (), 200, 0.0), 300) == 200
-    now[0] = 20.0  # well before it: no more than the plan's
-    assert late(State({}, (), 200, 0.0), 300) == 300
+    now[0] = 0.0
+    short = module.StepLimit(60.0)
+    now[0] = 10.0  # compiled
+    assert short(State({}, (), 1, 0.0), 3000) == 3000
+    now[0] = 19.0
+    with pytest.raises(InputError, match="leaves 51 training steps of 1000 ms .* at least 49 s"):
+        short(State({}, (), 10, 0.0), 3000)
 
 
 @pytest.mark.slow
 def test_a_campaign_s_runs_are_asked_for_again(beam, tests, tmp_path):
     """Resumed on other FEM runs, a training would not be the one that was begun."""
     stored = StoredRuns(tests, "0123456789abcdef")
-    plan = GraphNetwork(steps=30, simulations=6, batch=2, checkpoint_every=10)
-    whole = train(beam, plan, tmp_path, architecture=SMALL, campaign=stored)
+    plan = Physics(sweeps=0, simulations=6, steps=30, polish=0, checkpoint_every=10)
+    whole = train(beam, plan, tmp_path, architecture=SEPARABLE, campaign=stored)
     assert whole.record["plan"]["campaign"] == stored.digest
     with pytest.raises(InputError, match="trained on FEM runs of a campaign; resume it with"):
-        train(beam, GraphNetwork(), tmp_path, architecture=SMALL, resume=True)
-    resumed = train(
-        beam, GraphNetwork(), tmp_path, architecture=SMALL, resume=True, campaign=stored
-    )
+        train(beam, Physics(), tmp_path, resume=True)
+    resumed = train(beam, Physics(), tmp_path, resume=True, campaign=stored)
     leaves = [jax.tree.leaves(e.network.weights) for e in (whole, resumed)]
     for a, b in zip(*leaves, strict=True):
         np.testing.assert_array_equal(a, b)
     with pytest.raises(InputError, match="7 simulations of a campaign with 6"):
         train(beam, replace(plan, simulations=7), tmp_path, campaign=stored)
-    with pytest.raises(InputError, match="recipe 'family' takes no FEM runs, so no campaign"):
-        train(beam, recipe("family"), tmp_path, campaign=stored)
+    with pytest.raises(InputError, match="recipe 'sweeps' takes no FEM runs, so no campaign"):
+        train(beam, recipe("sweeps"), tmp_path, campaign=stored)

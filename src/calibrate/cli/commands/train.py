@@ -18,35 +18,25 @@ if TYPE_CHECKING:
     from emulator.training.plan import Plan
 
 
-_ENTRIES = ("objective", "steps", "simulations", "sweeps", "batch", "seed")  # of a plan
+_ENTRIES = ("steps", "simulations", "sweeps", "batch", "seed")  # of a plan
 
 
 def _add_plan(parser: ArgumentParser) -> None:
     from emulator.training import RECIPES
-    from emulator.training.objectives import OBJECTIVES
 
     parser.add_argument(
         "--recipe",
         choices=tuple(RECIPES),
-        help="default hybrid: Taylor series, network trained on the energy, discrepancy model of "
-        "FEM runs; mechanics: the same without the network, in a minute; modal: a network alone, "
-        "from values and slopes of FEM runs; physics: a network alone without any FEM run, from "
-        "the energy; sweeps: a polynomial, from the energy alone; family: the network of --start, "
-        "without FEM",
+        help="default mechanics: Taylor series and discrepancy model of FEM runs, in a minute; "
+        "physics: a network alone without any FEM run, from the energy; sweeps: a polynomial, "
+        "from the energy alone",
     )
     parser.add_argument(
         "--start",
         metavar="EMULATOR",
-        help="begin from the network of this emulator (folder or ventricle_family), whatever its "
-        "mesh; the recipe then is network, or family, unless another is given; for finer:SCENE by "
-        "two_meshes or sweeps: stand on this emulator of SCENE; give it again with --resume where "
-        "no network is trained",
-    )
-    parser.add_argument(
-        "--objective",
-        choices=OBJECTIVES,
-        help="what the network is trained on: the energy; FEM displacements; those and their "
-        "deformation gradients; FEM displacements and the energy",
+        help="begin from the network of a family of bodies (ventricle_family, or a folder) by "
+        "sweeps, or by another recipe; for finer:SCENE by sweeps or two_meshes: stand on this "
+        "emulator of SCENE; give it again with --resume",
     )
     length = parser.add_mutually_exclusive_group()
     length.add_argument(
@@ -61,7 +51,9 @@ def _add_plan(parser: ArgumentParser) -> None:
     add_scene,
     _add_plan,
     option("--simulations", type=int, help="FEM runs to train on"),
-    option("--sweeps", type=int, help="of recipes physics and sweeps, in place of FEM"),
+    option(
+        "--sweeps", type=int, help="of recipes physics (0 for FEM runs in their place) and sweeps"
+    ),
     option(
         "--campaign",
         "STORE.zarr",
@@ -87,7 +79,7 @@ def train(arguments: Namespace) -> Answer:
     check_folder(arguments.out)
     entries = _plan_entries(arguments)
     start = load(arguments.start) if arguments.start else None
-    usual = "hybrid" if start is None else "network" if start.family is None else "family"
+    usual = "mechanics" if start is None else "sweeps"
     plan = _plan(arguments.recipe or usual, entries, arguments.budget)
     campaign = None
     if arguments.campaign:
@@ -159,7 +151,8 @@ def _training_summary(folder: str, scene: str, record: Mapping[str, Any]) -> str
     plan = record["plan"]
     counts = [f"{plan['simulations']} FEM runs"] if plan.get("simulations") else []
     if "sweeps" in record:
-        counts = [f"no FEM run, {plan['sweeps']} sweeps"]
+        solved = "one" if record["sweeps"].get("fem_solutions") else "no"
+        counts = [f"{solved} FEM run, {plan['sweeps']} sweeps"]
     counts += [f"{plan['steps']} steps"] if "steps" in plan else []
     text = f"trained {scene}: {', '.join([*counts, f'{record["seconds"]:.0f} s'])}"
     choice = record.get("discrepancy") or {}
@@ -211,9 +204,10 @@ def _plan(name: str, entries: Mapping[str, Any], budget: str | None) -> Plan:
 def _unused(plan: Plan) -> dict[str, str]:
     """Return the options that change nothing under ``plan``, and why."""
     names = {each.name for each in fields(plan)}
-    network = "takes all FEM runs at every step" if plan.trains_network else "trains no network"
+    network = (
+        "learns from all equilibria at every step" if plan.trains_network else "trains no network"
+    )
     reasons = {
-        "objective": "learns modes and coefficients" if plan.trains_network else network,
         "steps": network,
         "batch": network,
         "simulations": "takes no FEM runs",
@@ -222,8 +216,6 @@ def _unused(plan: Plan) -> dict[str, str]:
     unused = {name: reason for name, reason in reasons.items() if name not in names}
     if not plan.runs and "sweeps" not in names:
         unused["simulations"] = reasons["simulations"]
-    if not names & {"steps", "simulations", "sweeps"}:
-        unused |= {"seed": "draws nothing at random", "budget": "trains nothing"}
     return unused
 
 

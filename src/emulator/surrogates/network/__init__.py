@@ -38,7 +38,6 @@ class Network:
     space : the entries of theta.
     graph : the augmented graph of the scene's mesh.
     scale : the scale of the network's output by component, (3,) mm.
-    basis : the modes given to a separable decoder, (f, n, 3) in units of ``scale``.
     theta : ``mean`` and ``sd`` of theta, each (p,) in the parameters' units, for a network whose
         input is standardised theta itself; empty for one that takes positions.
     weights : the state of the network, an NNX ``State``.
@@ -48,7 +47,6 @@ class Network:
     space: ParameterSpace
     graph: AugmentedGraph
     scale: np.ndarray
-    basis: np.ndarray
     theta: Mapping[str, np.ndarray] = field(default_factory=dict)
     weights: nnx.State = field(default_factory=lambda: nnx.State({}))
 
@@ -59,9 +57,7 @@ class Network:
     @property
     def outline(self) -> PIGNN:
         """The network with shapes in place of weights."""
-        return nnx.eval_shape(
-            lambda: PIGNN(self.architecture, self.graph, len(self.space), len(self.basis), 0)
-        )
+        return nnx.eval_shape(lambda: PIGNN(self.architecture, self.graph, len(self.space), 0))
 
     @cached_property
     def definition(self) -> nnx.GraphDef:
@@ -79,7 +75,7 @@ class Network:
         """Return the decoder and its part that does not depend on theta, by one processor pass."""
         network = nnx.merge(self.definition, weights)
         states = network.processor(self.graph)
-        return network.decoder, network.decoder.prepare(states, jnp.asarray(self.basis))
+        return network.decoder, network.decoder.prepare(states)
 
     def decode(self, decoder: Decoder, prepared: jax.Array, position: jax.Array) -> jax.Array:
         """Return the displacement (..., k, 3) mm at ``position`` (..., p), from :meth:`prepare`."""
@@ -110,13 +106,12 @@ class Network:
         return CachedPart(offset, np.asarray(prepared, dtype=float) * self.scale, coefficients)
 
     def arrays(self) -> dict[str, Any]:
-        """Return the weights, graph, scale, basis, and moments of theta by name."""
+        """Return the weights, graph, scale, and moments of theta by name."""
         return named_leaves(
             {
                 "weights": nnx.to_pure_dict(self.weights),
                 "graph": self.graph.arrays(),
                 "scale": self.scale,
-                "basis": self.basis,
                 "theta": dict(self.theta),
             }
         )
@@ -133,8 +128,7 @@ class Network:
         architecture = read_as(Architecture, description["architecture"], "architecture")
         graph = AugmentedGraph(**inside(arrays, "graph"), real=len(scene.mesh.nodes))
         theta = {name: widened(values) for name, values in inside(arrays, "theta").items()}
-        scale, basis = widened(arrays["scale"]), arrays["basis"]
-        empty = cls(architecture, scene.space, graph, scale, basis, theta)
+        empty = cls(architecture, scene.space, graph, widened(arrays["scale"]), theta)
         return empty.filled(inside(arrays, "weights"))
 
 
@@ -157,11 +151,8 @@ def fresh(
     architecture: Architecture,
     scale: np.ndarray,
     seed: int,
-    basis: np.ndarray | None = None,
 ) -> Network:
     """Return an untrained network, whose output is zero for every theta."""
-    if basis is None:
-        basis = np.zeros((0, *scene.held.shape), dtype=np.float32)
-    weights = nnx.state(PIGNN(architecture, graph, len(scene.space), len(basis), seed))
+    weights = nnx.state(PIGNN(architecture, graph, len(scene.space), seed))
     scale = np.asarray(scale, dtype=float)
-    return Network(architecture, scene.space, graph, scale, basis, weights=weights)
+    return Network(architecture, scene.space, graph, scale, weights=weights)

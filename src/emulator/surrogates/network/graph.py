@@ -6,35 +6,23 @@ neighbours, carry messages across the body (Dalton et al. 2023, Section 2.2).
 
 The mid-side nodes of quadratic tetrahedra are nodes of the graph, joined to the two corners of
 their edge; they replace the edge between those corners.
-
-For a network that has learned a family of ventricles (:func:`describe`), features are products of
-vectors that turn with the body (:mod:`emulator.geometry.heart_wall`),
-lengths over its size L and volumes over L^3. So a ventricle moved, turned or enlarged has the same
-features, and its displacement over L, with respect to its own vectors, is the same too, as it is in
-mechanics without gravity. Features are standardised by means and deviations of the family that the
-network was trained on, not of the body at hand.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from emulator.core.errors import InputError
-from emulator.geometry.heart_wall import Ventricle, ventricle
 from emulator.geometry.mesh import EDGES, frozen_array
-from emulator.scenes.scene import Scene, find_cavity
+from emulator.scenes.scene import Scene
 
 CLUSTER = 4
 """The mean number of nodes of a layer for each node of the layer above it."""
 NEIGHBOURS = 4
 """The number kappa of nearest neighbours that each virtual node is joined to."""
 _SMALLEST = 8  # least number of nodes of a layer; the last layer is joined completely
-_NEAREST = 1e-3  # least distance over L in a logarithm
-_REPEATED = ("wall over cavity", "length", "radius", "helix", "helix gradient")
-"""Numbers of the whole body that are features of every node, so that no message carries them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,32 +79,53 @@ class Hierarchy:
         """Return ``values`` (n, d) of the mesh nodes and their means over clusters, (N, d)."""
         each = [values]
         for parent in self.parents:
-            each.append(_cluster_means(each[-1], parent, int(parent.max()) + 1))
+            each.append(cluster_means(each[-1], parent, int(parent.max()) + 1))
         return np.concatenate(each)
 
 
 def hierarchy(positions: np.ndarray, edges: np.ndarray) -> Hierarchy:
     """Return virtual layers above the nodes at ``positions`` (n, 3), joined by ``edges`` (e, 2)."""
-    from sklearn.cluster import KMeans  # slow to import; a cached emulator needs no graph
-    from sklearn.neighbors import NearestNeighbors
-
     layer_edges, parents, offset = [edges], [], 0
     while (count := len(positions) // CLUSTER) >= _SMALLEST:
-        parent = KMeans(count, n_init=1, random_state=0).fit(positions).labels_
+        parent = clusters(positions, count)
         parents.append(parent)
         above = offset + len(positions)
         layer_edges.append(np.column_stack([offset + np.arange(len(positions)), above + parent]))
-        positions = _cluster_means(positions, parent, count)
+        positions = cluster_means(positions, parent, count)
         if count // CLUSTER < _SMALLEST:
             layer_edges.append(above + np.column_stack(np.triu_indices(count, 1)))
         else:
-            nearest = NearestNeighbors(n_neighbors=NEIGHBOURS + 1).fit(positions)
-            index = nearest.kneighbors(positions, return_distance=False)
-            joined = [np.repeat(index[:, 0], NEIGHBOURS), index[:, 1:].ravel()]
-            layer_edges.append(above + np.column_stack(joined))
+            layer_edges.append(above + neighbours(positions, NEIGHBOURS))
         offset = above
     pairs = np.unique(np.sort(np.concatenate(layer_edges), axis=1), axis=0)
     return Hierarchy(pairs, tuple(parents))
+
+
+def clusters(positions: np.ndarray, count: int, weights: np.ndarray | None = None) -> np.ndarray:
+    """Return which of ``count`` clusters each of the ``positions`` (n, 3) lies in, (n,).
+
+    weights : of the positions, (n,); equal by default.
+    """
+    from sklearn.cluster import KMeans  # slow to import; a cached emulator needs no graph
+
+    return KMeans(count, n_init=1, random_state=0).fit(positions, sample_weight=weights).labels_
+
+
+def nearest(
+    centres: np.ndarray, positions: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ``count`` centres nearest to each position and their distances, (n, count)."""
+    from sklearn.neighbors import NearestNeighbors  # slow to import
+
+    search = NearestNeighbors(n_neighbors=count).fit(centres)
+    distances, index = search.kneighbors(positions)
+    return index, distances
+
+
+def neighbours(positions: np.ndarray, count: int) -> np.ndarray:
+    """Return the pairs of each position and its ``count`` nearest ones, (n count, 2)."""
+    index, _ = nearest(positions, positions, count + 1)
+    return np.column_stack([np.repeat(index[:, 0], count), index[:, 1:].ravel()])
 
 
 def node_inputs(scene: Scene) -> np.ndarray:
@@ -145,10 +154,13 @@ def mesh_edges(elements: np.ndarray) -> np.ndarray:
     return np.unique(np.sort(pairs, axis=1), axis=0)
 
 
-def _cluster_means(values: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
+def cluster_means(
+    values: np.ndarray, labels: np.ndarray, count: int, weights: np.ndarray | None = None
+) -> np.ndarray:
+    """Return the means (count, d) over clusters of ``values`` (n, d), by ``weights`` (n,)."""
+    sizes = np.bincount(labels, weights, count)
     sums = np.zeros((count, values.shape[1]))
-    np.add.at(sums, labels, values)
-    sizes = np.bincount(labels, minlength=count)
+    np.add.at(sums, labels, values if weights is None else values * weights[:, None])
     if not sizes.all():
         raise InputError("graph: a cluster of nodes is empty; are there duplicate nodes?")
     return sums / sizes[:, None]
@@ -158,116 +170,3 @@ def _normalise(values: np.ndarray) -> np.ndarray:
     """Return columns of mean 0 and standard deviation 1; a constant column becomes 0."""
     sd = values.std(axis=0)
     return (values - values.mean(axis=0)) / np.where(sd > 1e-12, sd, 1.0)
-
-
-class BodyFeatures(NamedTuple):
-    """A ventricle as the network of a family is told of it.
-
-    graph : the graph, its features before standardisation.
-    vectors : the vectors of which the output is a combination, (n, 7, 3) mm.
-    shares : the part of the wall's volume at each node, (n,).
-    shape : the numbers that describe the whole body, by name.
-    """
-
-    graph: AugmentedGraph
-    vectors: np.ndarray
-    shares: np.ndarray
-    shape: dict[str, float]
-
-
-def describe(scene: Scene) -> BodyFeatures:
-    """Return the ventricle of ``scene``.
-
-    Refused are no fibres, no cavity under pressure or several, and what
-    :func:`~emulator.geometry.heart_wall.ventricle` refuses.
-    """
-    if scene.fibres is None:
-        raise InputError(f"scene '{scene.name}' has no fibres; this network was trained with them")
-    if scene.angles:
-        raise InputError(
-            f"scene '{scene.name}': theta turns its fibres, and this network was trained with "
-            "fibres that are known; train one for the scene"
-        )
-    cavity = find_cavity(scene).facet_set
-    try:
-        body = ventricle(scene.mesh, cavity, scene.held.all(axis=1))
-    except InputError as error:
-        raise InputError(f"scene '{scene.name}' is no ventricle to this network: {error}") from None
-    fibres = _fibre_tensor(body, scene)
-    shape = _shape(body, fibres)
-    local = np.column_stack([_places(body), _along_fibres(body, fibres)])
-    numbers = np.array([shape[name] for name in _REPEATED])
-    layers = hierarchy(body.offset, mesh_edges(scene.mesh.elements))
-    nodes = layers.extend(np.column_stack([local, np.tile(numbers, (len(local), 1))]))
-    receivers, senders = layers.pairs.T
-    positions, normals = layers.extend(body.offset), layers.extend(body.normal)
-    edges = _edges(positions, normals, body.axis, layers.pairs)
-    graph = AugmentedGraph(nodes, edges, senders, receivers, len(scene.mesh.nodes))
-    return BodyFeatures(graph, body.vectors() * body.size, body.volume / body.wall, shape)
-
-
-def _shape(body: Ventricle, fibres: np.ndarray) -> dict[str, float]:
-    """Return the numbers by which a body is compared with the family of a network."""
-    rim = body.inner & body.held
-    shares = body.volume / body.wall
-    helix = np.einsum("ni,nij,j->n", body.circumference, fibres, body.axis)
-    return {
-        "size": body.size,
-        "wall over cavity": float(np.log(body.wall / body.cavity)),
-        "length": float(-body.height[body.inner].min()),
-        "radius": float(np.linalg.norm(body.across[rim], axis=1).mean()),
-        "helix": float(shares @ helix),
-        "helix gradient": float(shares @ (helix * (body.depth - 0.5))),
-        "thicker": float(np.linalg.norm(body.lean)),
-        "spacing": float(np.log(len(body.depth))),
-    }
-
-
-def _places(body: Ventricle) -> np.ndarray:
-    """Return the features of the nodes' places, (n, 13)."""
-    n, x, lean = body.normal, body.across, body.lean
-    return np.column_stack(
-        [
-            body.held,
-            body.inner,
-            body.depth,
-            body.depth**2,
-            body.height,
-            np.linalg.norm(x, axis=1),
-            n @ body.axis,
-            np.einsum("ni,ni->n", n, x),
-            n @ lean,
-            x @ lean,
-            np.cross(body.axis, x) @ lean,
-            np.cbrt(body.volume),
-            np.log(np.maximum(-body.height, _NEAREST)),
-        ]
-    )
-
-
-def _along_fibres(body: Ventricle, fibres: np.ndarray) -> np.ndarray:
-    """Return products of the fibres with the node's vectors, (n, 6); a fibre has no sign."""
-    n, c = body.normal, body.circumference
-    k = np.broadcast_to(body.axis, n.shape)
-    pairs = ((k, k), (n, n), (c, c), (c, k), (n, k), (n, c))
-    return np.column_stack([np.einsum("ni,nij,nj->n", a, fibres, b) for a, b in pairs])
-
-
-def _fibre_tensor(body: Ventricle, scene: Scene) -> np.ndarray:
-    """Return the mean of f f^T over the elements at each node, weighted by volume, (n, 3, 3)."""
-    elements, fibres = scene.mesh.elements, scene.fibres_at_points
-    each = np.einsum("mq,mqi,mqj->mij", scene.discretisation.weights, fibres, fibres)
-    total = np.zeros((len(body.depth), 3, 3))
-    np.add.at(total, elements, each[:, None])
-    return total / np.trace(total, axis1=1, axis2=2)[:, None, None]
-
-
-def _edges(x: np.ndarray, normals: np.ndarray, axis: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Return positions from sender to receiver along n, c and k of their middle, and lengths."""
-    receivers, senders = pairs.T
-    relative = x[receivers] - x[senders]
-    n = 0.5 * (normals[receivers] + normals[senders])
-    c = np.cross(axis, n)
-    length = np.linalg.norm(relative, axis=1)
-    parts = [np.einsum("ei,ei->e", relative, direction) for direction in (n, c)]
-    return np.column_stack([*parts, relative @ axis, length])

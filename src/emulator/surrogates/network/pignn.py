@@ -11,8 +11,7 @@ nodes; and decode. The pointwise decoder, the paper's, applies to :math:`z_i` an
 theta one network for each displacement component. The separable decoder is
 :math:`\sum_k c_k(\theta)\, \phi_k(z_i)`, with a branch network :math:`c` of theta and a trunk
 network :math:`\phi` of the node, so that the modes :math:`\phi_k` can be kept and a displacement is
-one matrix product. Modes computed from mechanics may be added to the learned ones. Encoders and
-messages do not depend on theta and are evaluated once a geometry.
+one matrix product. Encoders and messages do not depend on theta and are evaluated once a geometry.
 """
 
 from __future__ import annotations
@@ -202,9 +201,8 @@ class PointwiseDecoder(nnx.Module):
         component = partial(MLP, (M, 2 * M), hidden, 1, layer_norm=False, zero_last=True, rngs=rngs)
         self.components = nnx.List([component() for _ in range(3)])
 
-    def prepare(self, states: jax.Array, basis: jax.Array) -> jax.Array:
+    def prepare(self, states: jax.Array) -> jax.Array:
         """Return what the states add to the first layer of each component, (3, n, hidden[0])."""
-        del basis  # this decoder has no coefficients
         return jnp.stack([component.project(1, states) for component in self.components])
 
     def __call__(self, prepared: jax.Array, theta: jax.Array) -> jax.Array:
@@ -223,10 +221,15 @@ def branch(parts: tuple[int, ...], out: int, architecture: Architecture, rngs: n
     return MLP(parts, widths, out, layer_norm=False, zero_last=True, rngs=rngs)
 
 
-def trunk(vectors: int, architecture: Architecture, rngs: nnx.Rngs) -> MLP:
-    """Return the network of the modes: from a node's state, ``vectors`` numbers for each mode."""
+def trunk(
+    vectors: int, architecture: Architecture, rngs: nnx.Rngs, parts: tuple[int, ...] = ()
+) -> MLP:
+    """Return the network of the modes: from a node's state, ``vectors`` numbers for each mode.
+
+    parts : the widths of its inputs, where it has others than the state.
+    """
     widths, out = architecture.trunk or architecture.hidden, vectors * architecture.modes
-    return MLP((2 * architecture.latent,), widths, out, layer_norm=False, rngs=rngs)
+    return MLP(parts or (2 * architecture.latent,), widths, out, layer_norm=False, rngs=rngs)
 
 
 class SeparableDecoder(nnx.Module):
@@ -238,16 +241,13 @@ class SeparableDecoder(nnx.Module):
 
     linear = True
 
-    def __init__(
-        self, architecture: Architecture, parameters: int, fixed: int, rngs: nnx.Rngs
-    ) -> None:
-        self.branch = branch((parameters,), fixed + architecture.modes, architecture, rngs)
+    def __init__(self, architecture: Architecture, parameters: int, rngs: nnx.Rngs) -> None:
+        self.branch = branch((parameters,), architecture.modes, architecture, rngs)
         self.trunk = trunk(3, architecture, rngs)
 
-    def prepare(self, states: jax.Array, basis: jax.Array) -> jax.Array:
-        """Return all modes (r, n, 3): ``basis`` (f, n, 3), then the learned ones."""
-        learned = self.trunk(states).reshape(len(states), 3, -1)
-        return jnp.concatenate([basis.astype(learned.dtype), jnp.moveaxis(learned, -1, 0)])
+    def prepare(self, states: jax.Array) -> jax.Array:
+        """Return the modes (r, n, 3)."""
+        return jnp.moveaxis(self.trunk(states).reshape(len(states), 3, -1), -1, 0)
 
     def __call__(self, prepared: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the output (..., n, 3) for normalised ``theta`` (..., p), from :meth:`prepare`."""
@@ -261,7 +261,7 @@ class PIGNN(nnx.Module):
     """Processor and decoder of one scene, with weights from a seed.
 
     graph : the graph, of which only the widths of features matter.
-    parameters, fixed : the numbers of entries of theta and of given modes.
+    parameters : the number of entries of theta.
     """
 
     def __init__(
@@ -269,7 +269,6 @@ class PIGNN(nnx.Module):
         architecture: Architecture,
         graph: AugmentedGraph,
         parameters: int,
-        fixed: int,
         seed: int,
     ) -> None:
         rngs = nnx.Rngs(seed)
@@ -278,5 +277,5 @@ class PIGNN(nnx.Module):
         self.decoder: Decoder = (
             PointwiseDecoder(architecture, parameters, rngs)
             if architecture.decoder == "pointwise"
-            else SeparableDecoder(architecture, parameters, fixed, rngs)
+            else SeparableDecoder(architecture, parameters, rngs)
         )

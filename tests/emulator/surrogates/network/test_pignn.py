@@ -23,7 +23,7 @@ def emulator(beam):
 
 def test_the_published_sizes_have_the_published_number_of_weights():
     graph = augment(em.scenes.once_clamped_beam(order=1))
-    network = PIGNN(Architecture(), graph, parameters=2, fixed=0, seed=0)
+    network = PIGNN(Architecture(), graph, parameters=2, seed=0)
     count = sum(leaf.size for leaf in jax.tree.leaves(nnx.state(network)))
     assert count == pytest.approx(510_000, rel=0.005)
 
