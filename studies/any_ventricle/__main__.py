@@ -7,7 +7,7 @@
     python -m studies.any_ventricle --train --runs DIR --out DIR   # how the network was trained
     python -m studies.any_ventricle --quick --out DIR
 
-Twenty ellipsoids, twenty irregular ventricles, four of them on a coarser and on a finer mesh, and
+Twenty ellipsoids, twenty irregular ventricles, four more on a coarser, a finer and a Gmsh mesh, and
 the measured heart's left ventricle at two times, meshed by Gmsh. Writes results.json, after each
 case, and any_ventricle.png; cases that are there are kept. The heart is left out where its surfaces
 or Gmsh are absent.

@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
-from studies.any_ventricle.shapes import USUAL, bodies
+from studies.any_ventricle.shapes import USUAL, Body, bodies
 
-from emulator.geometry.two_surfaces import mesh_wall
+from emulator.geometry.facets import flat_triangles
+from emulator.geometry.mesh import Mesh
+from emulator.geometry.surfaces import Surface
+from emulator.geometry.two_surfaces import Wall, mesh_wall
 from emulator.scenes.built_in.ventricles import MYOCARDIUM, PRESSURE
 from emulator.scenes.fibre_rules import Helix
 from emulator.scenes.scene import Scene
@@ -32,8 +36,11 @@ def test_bodies(count: int) -> dict[str, Callable[[], Scene]]:
         for name, (rings, around, layers) in _MESHES.items():
             other = replace(body, rings=rings, around=around, layers=layers)
             found[f"{name} {k}"] = partial(other.scene, 2, BOX)
-    if HEART.is_dir():
+    if find_spec("gmsh") and HEART.is_dir():
         found |= {name: partial(human, frame) for name, frame in FRAMES.items()}
+    if find_spec("gmsh"):
+        irregular = bodies(min(count, 4), 3, 1.0)
+        found |= {f"gmsh {k}": partial(meshed_by_gmsh, body) for k, body in enumerate(irregular)}
     return found
 
 
@@ -41,12 +48,31 @@ def human(frame: str) -> Scene:
     """The left ventricle of the measured heart, its surfaces of ``frame`` taken as at rest."""
     names = ("LV_ENDOCARDIAL", "EPICARDIAL", "RV_ENDOCARDIAL")
     inner, outer, right = (HEART / f"{name}_{frame}.obj" for name in names)
-    wall = mesh_wall(inner, outer, right=right)
+    return _scene("human", mesh_wall(inner, outer, right=right), (60.0, -60.0))
+
+
+def meshed_by_gmsh(body: Body) -> Scene:
+    """The scene of ``body``, its surfaces meshed anew as those of a scanned heart are."""
+    mesh = body.scene().mesh
+    surfaces = (_surface(mesh, name) for name in ("endocardium", "epicardium"))
+    return _scene("gmsh", mesh_wall(*surfaces), body.angles)
+
+
+def _surface(mesh: Mesh, name: str) -> Surface:
+    """A surface of a wall, of flat triangles between all its nodes."""
+    facets = flat_triangles(mesh.facet_set(name))
+    used, triangles = np.unique(facets, return_inverse=True)
+    triangles = triangles.reshape(facets.shape)
+    inside = name == "endocardium"  # the tissue's normals point into the cavity
+    return Surface(name, mesh.nodes[used], triangles[:, ::-1] if inside else triangles)
+
+
+def _scene(name: str, wall: Wall, angles: tuple[float, float]) -> Scene:
     axis = tuple(np.asarray(wall.axis).tolist())
-    rule = Helix((60.0, -60.0), axis=axis)
+    rule = Helix(angles, axis=axis)
     return replace(
         USUAL,
-        name="human",
+        name=name,
         mesh=wall.mesh,
         parameters=BOX,
         fibres=rule.directions(wall.mesh)[0],

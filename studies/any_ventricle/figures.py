@@ -9,7 +9,7 @@ from studies.common.output import Case, save
 
 from calibrate.figures import BLACK, BLUE, GREEN, VERMILION, pyplot
 
-KINDS = ("ellipsoid", "irregular", "coarser", "finer", "human")
+KINDS = ("ellipsoid", "irregular", "coarser", "finer", "gmsh", "human")
 WAYS = {
     "before": ("o", BLUE, "network, no FEM run"),
     "one_run": ("s", VERMILION, "series of one run"),

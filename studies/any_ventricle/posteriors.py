@@ -38,7 +38,7 @@ def first_posterior(make: Callable[[], Scene], number: int, tests: int, kept: Pa
     began = time.perf_counter()
     first = cal.sample(cal.model(load(NETWORK, scene).cache(), observe, noises), data)
     seconds = time.perf_counter() - began
-    bar = map_errors(first.model, simulator, first.draws())
+    bar = map_errors(first.model, simulator, first.draws(), first.data)
     series = Emulator(scene, taylor=expand(simulator, order=3))
     better = cal.sample(cal.model(series.cache(), observe, noises), data, predictions=False)
     certificate = cal.certify(better, simulator, draws=DRAWS, mesh=0)
@@ -49,8 +49,9 @@ def first_posterior(make: Callable[[], Scene], number: int, tests: int, kept: Pa
         "seconds_to_posterior": round(seconds, 1),
         "moved_sd": moves,
         "largest_move_sd": float(np.max(np.abs(list(moves.values())))),
-        "error_bar_noise_sd": bar,
-        "warned": map_fault(bar) is not None,
+        "error_bar_noise_sd": bar.sizes,
+        "error_bar_moves_sd": bar.moves if np.isfinite(bar.moves) else None,
+        "warned": map_fault(*bar) is not None,
         "certified": certificate.verdict,
         "reason": certificate.reason,
         "certified_move_sd": {n: f.value for n, f in certificate.evidence.draws.shift.items()},

@@ -40,7 +40,7 @@ from calibrate.certificate.predictive import Predictive
 from calibrate.certificate.runs import Runs, Solver, correction_from, descend
 from calibrate.certificate.verdict import Certificate, judge
 from calibrate.posterior import Posterior
-from calibrate.posterior.diagnosis import MAP_ERRORS
+from calibrate.posterior.diagnosis import MAP_ERRORS, MAP_MOVES
 from calibrate.posterior.posterior import make_tree
 from calibrate.samplers.diagnostics import effective, normalised
 from calibrate.samplers.laplace import MISSED_AT, MISSED_BY
@@ -61,7 +61,7 @@ _STABILITY = 20  # draws at which the sign of the tangent is examined
 _CHAINS = 4  # chains of a reweighted posterior
 _OF_OTHER_DRAWS = (
     "log_evidence", "log_evidence_error", "pareto_k", "importance_efficiency", MISSED_BY, MISSED_AT,
-    MAP_ERRORS, "weights_pareto_k", "evaluations", "effective_points",
+    MAP_ERRORS, MAP_MOVES, "weights_pareto_k", "evaluations", "effective_points",
 )  # fmt: skip
 
 

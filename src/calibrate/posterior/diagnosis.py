@@ -32,12 +32,14 @@ from calibrate.samplers import diagnostics as limits
 from calibrate.samplers import r_hat
 from calibrate.samplers.laplace import MISSED_AT, MISSED_BY
 
-# Attributes of a run, as JSON: errors of the map at its draws, sentences on noises by default.
+# Attributes of a run, as JSON: errors of the map at its draws, and sentences on noises by default.
 MAP_ERRORS, SCALED_NOISE = "map_errors", "scaled_noise"
+MAP_MOVES = "map_moves"  # a number: the most by which those errors may move a mean, in sd
 
 SMALLEST_P = 0.005
 OUTLYING = 4.0  # sds, beyond which 0.6 % of sets of 100 Gaussian data have a datum
 LARGEST_MAP_ERROR = 0.5  # noise sd by which the forward map may miss FEM's data
+LARGEST_MAP_MOVE = 0.5  # posterior sd by which that may move a mean, as for a finer mesh
 LARGEST_DIVERGENT = 0.002
 MAP_FIRST = "mend the map first"  # the remedy of chains on a wrong map
 _FEWEST = 200  # replicates from which a small p, or a share of the prior's sd, can be estimated
@@ -95,18 +97,20 @@ def sampling_faults(s: Sampling, box: Sequence[BoxEnd] = ()) -> Iterator[Fault]:
         )
 
 
-def map_fault(errors: Mapping[str, float]) -> Fault | None:
-    """Return what the forward map misses most, if by more than a share of the noise.
+def map_fault(errors: Mapping[str, float], moves: float = np.nan) -> Fault | None:
+    """Return what the forward map misses most, if by more than a share of the noise or of a mean.
 
     errors : the distance of the map's data from FEM's at the draws, in noise sd, by observation.
+    moves : the most by which that may move a posterior mean, in its sd; NaN if unknown.
     """
-    sizes = {name: np.nan_to_num(size, nan=np.inf, posinf=np.inf) for name, size in errors.items()}
+    sizes = {name: np.inf if np.isnan(size) else size for name, size in errors.items()}
     worst = max(sizes, key=sizes.__getitem__, default="")
-    if not (worst and sizes[worst] > LARGEST_MAP_ERROR):
+    if not worst or not (sizes[worst] > LARGEST_MAP_ERROR or moves > LARGEST_MAP_MOVE):
         return None
     size = f"{sizes[worst]:.2g} noise sd" if np.isfinite(sizes[worst]) else "an unknown amount"
+    most = f", which may move a mean by {moves:.2g} sd" if moves > LARGEST_MAP_MOVE else ""
     return (
-        f"the forward map misses FEM by {size} in {worst} at the draws",
+        f"the forward map misses FEM by {size} in {worst} at the draws{most}",
         "infer with --forward corrected (or more of its --steps), or let the map's error widen the "
         "posterior (--error-runs N)",
     )
@@ -153,7 +157,9 @@ def diagnose(
     box : the ends of ranges that end the posterior.
     """
     yield from json.loads(attributes.get(SCALED_NOISE, "[]"))
-    wrong_map = map_fault(json.loads(attributes.get(MAP_ERRORS, "{}")))
+    wrong_map = map_fault(
+        json.loads(attributes.get(MAP_ERRORS, "{}")), attributes.get(MAP_MOVES, np.nan)
+    )
     if wrong_map is not None:
         yield ": ".join(wrong_map)
     if box:

@@ -11,7 +11,7 @@ from calibrate.certificate import Certificate, examine
 from calibrate.certificate.check import can_reweight, reweighted
 from calibrate.measurements import missing_values
 from calibrate.posterior import Posterior, sample
-from calibrate.posterior.diagnosis import MAP_ERRORS, SCALED_NOISE
+from calibrate.posterior.diagnosis import MAP_ERRORS, MAP_MOVES, SCALED_NOISE
 from calibrate.project.problem import Problem, build_model, read_problem, simulator_of, with_data
 from calibrate.project.results import (
     CERTIFICATE,
@@ -24,7 +24,7 @@ from calibrate.project.results import (
 from calibrate.project.run import Run
 from calibrate.provenance import as_attributes
 from calibrate.state_names import split
-from calibrate.statistical_model.errors import map_errors
+from calibrate.statistical_model.errors import NOT_ASKED, map_errors
 from emulator.core.display import Stages
 from emulator.core.errors import InputError
 from emulator.core.store import write_json
@@ -81,12 +81,15 @@ def infer(
                 progress=progress,
                 checkpoint=None if target is None else target / SAMPLING,
             )
-        errors = {}
+        errors = NOT_ASKED
         if check_map and not isinstance(model.full, FEMForward):
             with stages("check of the map"):
-                errors = map_errors(posterior.model, problem.simulator, posterior.draws())
+                errors = map_errors(
+                    posterior.model, problem.simulator, posterior.draws(), posterior.data
+                )
         attributes = {
-            SCALED_NOISE: problem.scaled_noise, MAP_ERRORS: errors, SECONDS: stages.seconds,
+            SCALED_NOISE: problem.scaled_noise, MAP_ERRORS: errors.sizes, MAP_MOVES: errors.moves,
+            SECONDS: stages.seconds,
         }  # fmt: skip
         posterior.tree.attrs.update(as_attributes(attributes))
         if target is not None:
@@ -124,7 +127,9 @@ def certify_and_keep(
     write_json(Path(folder) / CERTIFICATE, check.certificate.to_json())
     errors = check.certificate.evidence.map_errors
     seconds = json.loads(posterior.tree.attrs.get(SECONDS, "{}")) | stages.seconds
-    posterior.tree.attrs.update(as_attributes({MAP_ERRORS: errors, SECONDS: seconds}))
+    posterior.tree.attrs.update(
+        as_attributes({MAP_ERRORS: errors, MAP_MOVES: {}, SECONDS: seconds})
+    )
     remove_pages(Path(folder).resolve())
     if reweight_to is not None and can_reweight(check.certificate):
         save_reweighted(reweighted(check), Path(folder), Path(reweight_to))

@@ -26,7 +26,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -50,6 +50,7 @@ from emulator.fem.compiled import compiled
 FEWEST = 8  # FEM runs from which an error is learned
 _MODES = 12
 _STEPS = 8  # Newton steps that tell the map's error at draws, over all load states
+_FEWEST_CHANGES = 4  # draws of which an sd is taken
 _WIDTHS = np.geomspace(0.05, 2.0, 12)  # kernel widths in standardised unknowns
 
 
@@ -205,20 +206,46 @@ def with_error(
     return replace(model, error=fitted)
 
 
+class MapErrors(NamedTuple):
+    r"""What the error of a forward map does to a posterior.
+
+    sizes : the error of the data in noise sd, as of :func:`in_noise_sd`, by the observation's name.
+    moves : the most by which it may move the mean of an unknown, in posterior sd; NaN if unknown.
+
+    With FEM in place of the map, log likelihoods change by :math:`d(x)` and, to first order, a mean
+    by :math:`\operatorname{Cov}(x, d)`, at most :math:`\operatorname{sd}(x) \operatorname{sd}(d)`:
+    the sd of the change over the draws.
+    """
+
+    sizes: Mapping[str, float]
+    moves: float
+
+
+NOT_ASKED = MapErrors({}, np.nan)
+"""The errors of a map that was not compared with FEM."""
+
+
 def map_errors(
-    model: Model, simulator: Simulator, draws: Mapping[str, np.ndarray]
-) -> dict[str, float]:
-    """Return the map's errors as of :func:`in_noise_sd`, to first order.
+    model: Model,
+    simulator: Simulator,
+    draws: Mapping[str, np.ndarray],
+    data: Mapping[str, Any],
+) -> MapErrors:
+    """Return what the map's errors do to a posterior, to first order.
 
     A Newton step at each of a few draws tells them, where its own check accepts it. Where it does
     at none, one FEM run at a draw does; the errors are infinite where that fails.
 
-    draws : draws (s,) by the unknown's name.
+    draws : draws (s,) by the unknown's name, or by an inferred noise sd's.
+    data : the data by the observation's name.
     """
     if simulator.scene.loaded_by:
-        return {}  # its equations are of two displacements: at rest, and from there to the mesh
+        return MapErrors(
+            {}, {}
+        )  # its equations are of two displacements: at rest, and from there to the mesh
     distance = compiled(partial(newton_distance, simulator.system))
     observe, predict, means = model.observe, jax.jit(model.full), jax.jit(model.means)
+    likelihood = jax.jit(model.map_log_likelihood)
     states, count = len(model.states.states), len(next(iter(draws.values())))
 
     def by_newton(u: jax.Array, theta: jax.Array) -> jax.Array:
@@ -229,17 +256,26 @@ def map_errors(
         solution = simulator.solve(theta, u)
         return solution.displacement if solution.converged else jnp.full_like(u, jnp.inf)
 
-    def error_at(row: int, equilibrium: Callable[..., jax.Array]) -> jax.Array:
-        thetas = model.states.thetas({name: values[row] for name, values in draws.items()})
+    def asked(row: int, equilibrium: Callable[..., jax.Array]) -> tuple[np.ndarray, float]:
+        """Return the map's data less FEM's, and the change of the log likelihood."""
+        draw = {name: values[row] for name, values in draws.items()}
+        thetas = model.states.thetas(draw)
         u = jnp.stack([equilibrium(predict(theta), theta) for theta in thetas])
         exact = observe(u[:, observe.nodes], thetas)
-        seen = means(thetas)[0], exact
-        return jnp.subtract(*(ravel_pytree(each)[0] for each in seen))
+        error = np.asarray(ravel_pytree(means(thetas)[0])[0] - ravel_pytree(exact)[0])
+        if not np.isfinite(error).all():
+            return error, np.nan
+        return error, float(model.fem_log_likelihood(draw, exact, data) - likelihood(draw, data))
 
     rows = np.linspace(0, count - 1, max(_STEPS // states, 1) + 2)[1:-1].astype(int)
-    errors = [error_at(row, by_newton) for row in rows]
-    errors = [each for each in errors if jnp.isfinite(each).all()]
-    return in_noise_sd(model, np.array(errors or [error_at(rows[len(rows) // 2], by_fem)]), draws)
+    found = [asked(row, by_newton) for row in rows]
+    found = [each for each in found if np.isfinite(each[0]).all()]
+    found = found or [asked(rows[len(rows) // 2], by_fem)]
+    errors, changes = (np.array(each) for each in zip(*found, strict=True))
+    if not (sizes := in_noise_sd(model, errors, draws)):
+        return NOT_ASKED
+    known = len(changes) >= _FEWEST_CHANGES
+    return MapErrors(sizes, float(changes.std(ddof=1)) if known else np.nan)
 
 
 def noise_sds(model: Model, draws: Mapping[str, np.ndarray]) -> dict[str, float]:

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from calibrate.posterior.diagnosis import MAP_ERRORS, SCALED_NOISE, diagnose, nothing_learned
+from calibrate.posterior.diagnosis import (
+    MAP_ERRORS,
+    MAP_MOVES,
+    SCALED_NOISE,
+    diagnose,
+    nothing_learned,
+)
 
 GOOD = {"mu": {"r_hat": 1.001, "ess_bulk": 900.0, "ess_tail": 800.0}}
 DRAWS = {"mu": np.random.default_rng(0).normal(70.0, 2.0, size=(4, 500))}
@@ -71,7 +77,14 @@ def test_a_wrong_map_comes_first_and_chains_on_it_are_not_blamed_on_the_sampler(
     assert "--error-runs N" in first
     assert chains == "the chains disagree about mu, R-hat 1.500: mend the map first"
     assert "more draws" not in few
-    assert said(attributes={MAP_ERRORS: json.dumps({"volume": 0.4})}) == []
+    small = {MAP_ERRORS: json.dumps({"volume": 0.4})}
+    assert said(attributes=small) == []
+    assert said(attributes=small | {MAP_MOVES: 0.4}) == []
+    (moved,) = said(attributes=small | {MAP_MOVES: 0.6})
+    assert moved.startswith(
+        "the forward map misses FEM by 0.4 noise sd in volume at the draws, which may move a mean "
+        "by 0.6 sd"
+    )
     assert said(attributes={SCALED_NOISE: json.dumps(["volume has"])}) == ["volume has"]
 
 

@@ -207,15 +207,32 @@ def test_a_newton_step_tells_what_the_map_misses(beam, simulator, aware):
         name: np.full(20, float(value)) for name, value in zip(model.names, theta, strict=True)
     }
     off = np.asarray(forward(theta) - simulator(theta))[NODES]
-    told = map_errors(model, simulator, draws)
+    data = model.check_data(np.asarray(simulator(theta))[NODES])
+    told = map_errors(model, simulator, draws, data).sizes
     assert told == {"displacement": pytest.approx(np.sqrt(np.mean(off**2)) / NOISE, rel=0.1)}
     assert told["displacement"] > 1.0
-    assert map_errors(replace(model, error=aware.error), simulator, draws) == {}
+    assert not map_errors(replace(model, error=aware.error), simulator, draws, data).sizes
     # Noise that is inferred, and that correlates: the sd of one number, as the draws have it.
     noise = cal.CorrelatedNoise(length=20.0, sd_scale=100.0, spatial_sd=0.4 * NOISE)
     model = cal.model(forward, cal.nodal_displacements(beam, NODES), noise)
-    inferred = map_errors(model, simulator, draws | {"noise_sd": np.full(20, 0.3 * NOISE)})
-    assert inferred["displacement"] == pytest.approx(2.0 * told["displacement"])
+    draws |= {"noise_sd": np.full(20, 0.3 * NOISE)}
+    inferred = map_errors(model, simulator, draws, data)
+    assert inferred.sizes["displacement"] == pytest.approx(2.0 * told["displacement"])
+
+
+def test_a_map_s_error_moves_no_mean_by_more_than_is_told(beam, simulator):
+    """Against FEM's log likelihoods at the draws that are asked, written by hand."""
+    forward = em.Emulator(beam, taylor=expand(simulator, order=1)).cache()
+    model = cal.model(forward, cal.nodal_displacements(beam, NODES), cal.GaussianNoise(sd=0.1))
+    rng = np.random.default_rng(2)
+    draws = {"mu": rng.uniform(70.0, 95.0, 10), "lam": rng.uniform(55.0, 80.0, 10)}
+    thetas = [beam.theta(mu=mu, lam=lam) for mu, lam in zip(*draws.values(), strict=True)]
+    exact, seen = ([np.asarray(f(t))[NODES] for t in thetas] for f in (simulator, forward))
+    y = exact[0] + 0.1 * rng.normal(size=exact[0].shape)
+    changes = [50.0 * np.sum((y - g) ** 2 - (y - u) ** 2) for g, u in zip(seen, exact, strict=True)]
+    told = map_errors(model, simulator, draws, model.check_data(y))
+    assert told.moves == pytest.approx(np.std(changes[1:9], ddof=1), rel=0.1)
+    assert told.moves > 0.1
 
 
 def test_fem_tells_what_a_map_misses_where_no_newton_step_does(beam, simulator):
@@ -229,8 +246,10 @@ def test_fem_tells_what_a_map_misses_where_no_newton_step_does(beam, simulator):
     values = zip(model.names, theta, strict=True)
     draws = {name: np.full(20, float(value)) for name, value in values}
     expected = np.sqrt(np.mean(np.asarray(rough)[NODES] ** 2)) / NOISE
-    told = map_errors(model, simulator, draws)
-    assert told == {"displacement": pytest.approx(expected, rel=1e-6)}
+    data = model.check_data(np.asarray(u)[NODES])
+    told = map_errors(model, simulator, draws, data)
+    assert np.isnan(told.moves)  # of one run
+    assert told.sizes == {"displacement": pytest.approx(expected, rel=1e-6)}
     lost = em.Simulator(beam, NewtonOptions(max_iterations=1))
-    told = map_errors(model, lost, draws)
-    assert "misses FEM by an unknown amount in displacement" in map_fault(told)[0]
+    told = map_errors(model, lost, draws, data)
+    assert "misses FEM by an unknown amount in displacement" in map_fault(*told)[0]
