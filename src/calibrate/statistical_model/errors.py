@@ -234,15 +234,13 @@ def map_errors(
     """Return what the map's errors do to a posterior, to first order.
 
     A Newton step at each of a few draws tells them, where its own check accepts it. Where it does
-    at none, one FEM run at a draw does; the errors are infinite where that fails.
+    at fewer than four, FEM runs make it four; the errors are infinite where most of those fail.
 
     draws : draws (s,) by the unknown's name, or by an inferred noise sd's.
     data : the data by the observation's name.
     """
     if simulator.scene.loaded_by:
-        return MapErrors(
-            {}, {}
-        )  # its equations are of two displacements: at rest, and from there to the mesh
+        return NOT_ASKED  # its equations are of two displacements: at rest, and from there on
     distance = compiled(partial(newton_distance, simulator.system))
     observe, predict, means = model.observe, jax.jit(model.full), jax.jit(model.means)
     likelihood = jax.jit(model.map_log_likelihood)
@@ -268,9 +266,10 @@ def map_errors(
         return error, float(model.fem_log_likelihood(draw, exact, data) - likelihood(draw, data))
 
     rows = np.linspace(0, count - 1, max(_STEPS // states, 1) + 2)[1:-1].astype(int)
-    found = [asked(row, by_newton) for row in rows]
-    found = [each for each in found if np.isfinite(each[0]).all()]
-    found = found or [asked(rows[len(rows) // 2], by_fem)]
+    steps = {row: asked(row, by_newton) for row in rows}
+    found = [each for each in steps.values() if np.isfinite(each[0]).all()]
+    missing = [row for row, (error, _) in steps.items() if not np.isfinite(error).all()]
+    found += [asked(row, by_fem) for row in missing[: max(_FEWEST_CHANGES - len(found), 0)]]
     errors, changes = (np.array(each) for each in zip(*found, strict=True))
     if not (sizes := in_noise_sd(model, errors, draws)):
         return NOT_ASKED

@@ -248,7 +248,7 @@ def test_fem_tells_what_a_map_misses_where_no_newton_step_does(beam, simulator):
     expected = np.sqrt(np.mean(np.asarray(rough)[NODES] ** 2)) / NOISE
     data = model.check_data(np.asarray(u)[NODES])
     told = map_errors(model, simulator, draws, data)
-    assert np.isnan(told.moves)  # of one run
+    assert told.moves == 0.0  # the draws are all the same
     assert told.sizes == {"displacement": pytest.approx(expected, rel=1e-6)}
     lost = em.Simulator(beam, NewtonOptions(max_iterations=1))
     told = map_errors(model, lost, draws, data)
