@@ -7,6 +7,8 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from calibrate.certificate import Certificate, examine
 from calibrate.certificate.check import can_reweight, reweighted
 from calibrate.measurements import missing_values
@@ -127,9 +129,9 @@ def certify_and_keep(
     write_json(Path(folder) / CERTIFICATE, check.certificate.to_json())
     errors = check.certificate.evidence.map_errors
     seconds = json.loads(posterior.tree.attrs.get(SECONDS, "{}")) | stages.seconds
-    posterior.tree.attrs.update(
-        as_attributes({MAP_ERRORS: errors, MAP_MOVES: {}, SECONDS: seconds})
-    )
+    # By how far FEM moves the means is known now.
+    attributes = {MAP_ERRORS: errors, MAP_MOVES: np.nan, SECONDS: seconds}
+    posterior.tree.attrs.update(as_attributes(attributes))
     remove_pages(Path(folder).resolve())
     if reweight_to is not None and can_reweight(check.certificate):
         save_reweighted(reweighted(check), Path(folder), Path(reweight_to))

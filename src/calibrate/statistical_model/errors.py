@@ -32,6 +32,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from scipy.stats import chi2
 
 from calibrate.model_error.kinds import Measured, read_systematic
 from calibrate.model_error.marginal import Amplitude, ModelError
@@ -51,6 +52,7 @@ FEWEST = 8  # FEM runs from which an error is learned
 _MODES = 12
 _STEPS = 8  # Newton steps that tell the map's error at draws, over all load states
 _FEWEST_CHANGES = 4  # draws of which an sd is taken
+_BELIEVED = 0.9  # probability with which an sd lies below its bound
 _WIDTHS = np.geomspace(0.05, 2.0, 12)  # kernel widths in standardised unknowns
 
 
@@ -214,7 +216,7 @@ class MapErrors(NamedTuple):
 
     With FEM in place of the map, log likelihoods change by :math:`d(x)` and, to first order, a mean
     by :math:`\operatorname{Cov}(x, d)`, at most :math:`\operatorname{sd}(x) \operatorname{sd}(d)`:
-    the sd of the change over the draws.
+    the sd of the change over the draws. From a few draws follows its upper 90 % bound.
     """
 
     sizes: Mapping[str, float]
@@ -269,12 +271,17 @@ def map_errors(
     steps = {row: asked(row, by_newton) for row in rows}
     found = [each for each in steps.values() if np.isfinite(each[0]).all()]
     missing = [row for row, (error, _) in steps.items() if not np.isfinite(error).all()]
-    found += [asked(row, by_fem) for row in missing[: max(_FEWEST_CHANGES - len(found), 0)]]
+    lacking = min(max(_FEWEST_CHANGES - len(found), 0), len(missing))
+    spread = np.linspace(0, len(missing) - 1, lacking).astype(int)
+    found += [asked(missing[k], by_fem) for k in spread]
     errors, changes = (np.array(each) for each in zip(*found, strict=True))
     if not (sizes := in_noise_sd(model, errors, draws)):
         return NOT_ASKED
-    known = len(changes) >= _FEWEST_CHANGES
-    return MapErrors(sizes, float(changes.std(ddof=1)) if known else np.nan)
+    if (count := len(changes)) < _FEWEST_CHANGES:
+        return MapErrors(sizes, np.nan)
+    # The sd of few values: its upper bound, that of a chi-squared variable.
+    above = np.sqrt((count - 1) / chi2.ppf(1.0 - _BELIEVED, count - 1))
+    return MapErrors(sizes, float(above * changes.std(ddof=1)))
 
 
 def noise_sds(model: Model, draws: Mapping[str, np.ndarray]) -> dict[str, float]:
