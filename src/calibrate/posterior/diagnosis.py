@@ -101,14 +101,17 @@ def map_fault(errors: Mapping[str, float], moves: float = np.nan) -> Fault | Non
     """Return what the forward map misses most, if by more than a share of the noise or of a mean.
 
     errors : the distance of the map's data from FEM's at the draws, in noise sd, by observation.
-    moves : the most by which that may move a posterior mean, in its sd; NaN if unknown.
+    moves : the most by which that may move a posterior mean, in its sd; NaN where nobody asked.
     """
     sizes = {name: np.inf if np.isnan(size) else size for name, size in errors.items()}
     worst = max(sizes, key=sizes.__getitem__, default="")
     if not worst or not (sizes[worst] > LARGEST_MAP_ERROR or moves > LARGEST_MAP_MOVE):
         return None
-    size = f"{sizes[worst]:.2g} noise sd" if np.isfinite(sizes[worst]) else "an unknown amount"
-    most = f", which may move a mean by {moves:.2g} sd" if moves > LARGEST_MAP_MOVE else ""
+    size, most = (
+        f"{value:.2g} {unit}" if np.isfinite(value) else "an unknown amount"
+        for value, unit in ((sizes[worst], "noise sd"), (moves, "sd"))
+    )
+    most = f", which may move a mean by {most}" if moves > LARGEST_MAP_MOVE else ""
     return (
         f"the forward map misses FEM by {size} in {worst} at the draws{most}",
         "infer with --forward corrected (or more of its --steps), or let the map's error widen the "

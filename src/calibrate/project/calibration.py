@@ -129,7 +129,7 @@ def certify_and_keep(
     write_json(Path(folder) / CERTIFICATE, check.certificate.to_json())
     errors = check.certificate.evidence.map_errors
     seconds = json.loads(posterior.tree.attrs.get(SECONDS, "{}")) | stages.seconds
-    # By how far FEM moves the means is known now.
+    # The certificate tells the moves themselves, so their bound goes.
     attributes = {MAP_ERRORS: errors, MAP_MOVES: np.nan, SECONDS: seconds}
     posterior.tree.attrs.update(as_attributes(attributes))
     remove_pages(Path(folder).resolve())

@@ -212,7 +212,8 @@ class MapErrors(NamedTuple):
     r"""What the error of a forward map does to a posterior.
 
     sizes : the error of the data in noise sd, as of :func:`in_noise_sd`, by the observation's name.
-    moves : the most by which it may move the mean of an unknown, in posterior sd; NaN if unknown.
+    moves : the most by which it may move the mean of an unknown, in posterior sd; NaN where too few
+        draws were asked, infinite where FEM failed at one.
 
     With FEM in place of the map, log likelihoods change by :math:`d(x)` and, to first order, a mean
     by :math:`\operatorname{Cov}(x, d)`, at most :math:`\operatorname{sd}(x) \operatorname{sd}(d)`:
@@ -241,8 +242,9 @@ def map_errors(
     draws : draws (s,) by the unknown's name, or by an inferred noise sd's.
     data : the data by the observation's name.
     """
-    if simulator.scene.loaded_by:
-        return NOT_ASKED  # its equations are of two displacements: at rest, and from there on
+    # Equations of a body that is loaded at rest are of two displacements: at rest, and from there.
+    if simulator.scene.loaded_by or _allows_for_map(model):
+        return NOT_ASKED
     distance = compiled(partial(newton_distance, simulator.system))
     observe, predict, means = model.observe, jax.jit(model.full), jax.jit(model.means)
     likelihood = jax.jit(model.map_log_likelihood)
@@ -264,24 +266,40 @@ def map_errors(
         exact = observe(u[:, observe.nodes], thetas)
         error = np.asarray(ravel_pytree(means(thetas)[0])[0] - ravel_pytree(exact)[0])
         if not np.isfinite(error).all():
-            return error, np.nan
+            return error, np.inf
         return error, float(model.fem_log_likelihood(draw, exact, data) - likelihood(draw, data))
 
     rows = np.linspace(0, count - 1, max(_STEPS // states, 1) + 2)[1:-1].astype(int)
-    steps = {row: asked(row, by_newton) for row in rows}
-    found = [each for each in steps.values() if np.isfinite(each[0]).all()]
-    missing = [row for row, (error, _) in steps.items() if not np.isfinite(error).all()]
-    lacking = min(max(_FEWEST_CHANGES - len(found), 0), len(missing))
-    spread = np.linspace(0, len(missing) - 1, lacking).astype(int)
-    found += [asked(missing[k], by_fem) for k in spread]
+    found, refused = [], []
+    for row in np.unique(rows):
+        error, change = asked(row, by_newton)
+        if np.isfinite(change):
+            found.append((error, change))
+        else:
+            refused.append(row)
+    lacking = min(max(_FEWEST_CHANGES - len(found), 0), len(refused))
+    spread = np.linspace(0, len(refused) - 1, lacking).astype(int)
+    found += [asked(refused[k], by_fem) for k in spread]
     errors, changes = (np.array(each) for each in zip(*found, strict=True))
-    if not (sizes := in_noise_sd(model, errors, draws)):
-        return NOT_ASKED
-    if (count := len(changes)) < _FEWEST_CHANGES:
-        return MapErrors(sizes, np.nan)
-    # The sd of few values: its upper bound, that of a chi-squared variable.
-    above = np.sqrt((count - 1) / chi2.ppf(1.0 - _BELIEVED, count - 1))
-    return MapErrors(sizes, float(above * changes.std(ddof=1)))
+    return MapErrors(in_noise_sd(model, errors, draws), _bound_of_sd(changes))
+
+
+def _bound_of_sd(changes: np.ndarray) -> float:
+    """Return the upper bound of the sd of which ``changes`` (k,) are a few draws.
+
+    The sum of squares about their mean, over the variance, is a chi-squared variable.
+    """
+    freedom = len(changes) - 1
+    if len(changes) < _FEWEST_CHANGES:
+        return np.nan
+    if not np.isfinite(changes).all():
+        return np.inf
+    return float(changes.std(ddof=1) * np.sqrt(freedom / chi2.ppf(1.0 - _BELIEVED, freedom)))
+
+
+def _allows_for_map(model: Model) -> bool:
+    """Return whether the likelihood of ``model`` allows for the map's error already."""
+    return model.error is not None and model.error.amplitude is not None
 
 
 def noise_sds(model: Model, draws: Mapping[str, np.ndarray]) -> dict[str, float]:
@@ -306,7 +324,7 @@ def in_noise_sd(
     errors : the map's data less FEM's at draws, flat (s, m).
     draws : draws (s,) by the unknown's name, of which an inferred noise sd is taken.
     """
-    if not len(errors) or (model.error is not None and model.error.amplitude is not None):
+    if not len(errors) or _allows_for_map(model):
         return {}
     unravel = ravel_pytree({name: jnp.zeros(n) for name, n in model.observe.shapes.items()})[1]
     sizes, sds = {}, noise_sds(model, draws)

@@ -79,7 +79,7 @@ class Mechanics(DiscrepancyPlan):
                 f"recipe '{self.recipe}' begins from the network of a family of bodies; the "
                 f"emulator of '{start.scene.name}' has none"
             )
-        network = None if start is None or start.family is None else family_on(scene, start)
+        network = None if start is None else family_on(scene, start)
         series, runs = _series_and_runs(job, self)
         if network is None:
             return Emulator(scene, taylor=series), runs, series

@@ -235,6 +235,10 @@ def test_a_map_s_error_moves_no_mean_by_more_than_is_told(beam, simulator):
     bound = np.std(changes[1:9], ddof=1) * np.sqrt(7.0 / 2.833)
     assert told.moves == pytest.approx(bound, rel=0.1)
     assert told.moves > 0.1
+    # The draws weighted by FEM's likelihood over the map's, as their means move.
+    weights = np.exp(changes) / np.sum(np.exp(changes))
+    for values in draws.values():
+        assert abs(weights @ values - values.mean()) < told.moves * values.std()
 
 
 def test_fem_tells_what_a_map_misses_where_no_newton_step_does(beam, simulator):
@@ -254,4 +258,5 @@ def test_fem_tells_what_a_map_misses_where_no_newton_step_does(beam, simulator):
     assert told.sizes == {"displacement": pytest.approx(expected, rel=1e-6)}
     lost = em.Simulator(beam, NewtonOptions(max_iterations=1))
     told = map_errors(model, lost, draws, data)
+    assert told.moves == np.inf
     assert "misses FEM by an unknown amount in displacement" in map_fault(*told)[0]
