@@ -48,6 +48,7 @@ from emulator.fem.energy import (
     volume_ratio,
 )
 from emulator.fem.linear import (
+    Outcome,
     Pattern,
     block_pattern,
     upper_blocks,
@@ -371,6 +372,11 @@ class System:
         if self.kept is not None and not is_traced(tangent, rhs):
             return self.kept.attempt(tangent, rhs, may_reuse=may_reuse)
         return self._compiled(attempt)(tangent, rhs)
+
+    def is_definite(self, tangent: jax.Array) -> bool:
+        """Return whether a tangent of numbers is positive definite: it is factorised to see it."""
+        zero = jnp.zeros(len(self.free))
+        return int(self.attempt(tangent, zero, may_reuse=False)[1]) == Outcome.OK
 
     def _compiled(self, how: Callable[..., Any]) -> Callable[..., Any]:
         """Return ``how`` with the tangent's pattern, compiled once."""

@@ -32,7 +32,6 @@ from emulator.fem.assembly import System
 from emulator.fem.compiled import compiled, is_traced, one_by_one
 from emulator.fem.derivatives import Equations, implicit
 from emulator.fem.fallbacks import find_equilibrium
-from emulator.fem.linear import Outcome
 from emulator.fem.newton import NewtonOptions
 from emulator.fem.solution import Solution
 from emulator.fem.unloading import Unloaded, Unloader, system_at_rest, unchecked
@@ -134,8 +133,7 @@ class LoadedEquilibrium:
     def is_stable(self, v: jax.Array, theta: jax.Array) -> bool:
         """Return whether ``v`` (n, 3) mm from the mesh is a minimum of the energy."""
         w = self.unloaded(theta).displacement
-        K, zero = _tangent(self.system, v - w, theta, w), jnp.zeros(len(self.system.free))
-        return int(self.system.attempt(K, zero)[1]) == Outcome.OK
+        return self.system.is_definite(_tangent(self.system, v - w, theta, w))
 
     @cached_property
     def _load(self) -> Callable[[jax.Array, jax.Array, jax.Array], Solution]:

@@ -35,7 +35,6 @@ from emulator.fem.derivatives import (
     sensitivities,
 )
 from emulator.fem.energy import require_shape
-from emulator.fem.linear import Outcome
 from emulator.fem.linear.suitesparse import prepare
 from emulator.fem.loaded import LoadedEquilibrium
 from emulator.fem.newton import NewtonOptions
@@ -221,8 +220,7 @@ class Simulator(TableRepr):
             return bool(np.isfinite(u).all()) and self._loaded.is_stable(u, theta)
         if not (np.isfinite(u).all() and self.system.least_volume_ratio(u) > 0.0):
             return False
-        zero = jnp.zeros(len(self.system.free))
-        return int(self.system.attempt(self.tangent(u, theta), zero)[1]) == Outcome.OK
+        return self.system.is_definite(self.tangent(u, theta))
 
     def reactions(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the force (n, 3) in mN of the supports on the body at the equilibrium ``u``.

@@ -4,6 +4,10 @@ The form does not depend on the order of tetrahedra and facets, nor on the order
 ranges. Two scenes have equal solutions if their identities agree; a scene's *fingerprint*
 hashes its identity together with theta's order and box. Emulators and posteriors store the
 fingerprint and refuse a scene whose fingerprint differs.
+
+Every field of a scene is in its identity. Those of ``_FORMS`` have a canonical form of their own,
+those of ``_LEFT_OUT`` change no solution, and any other field, also one that is added later, is
+described entry by entry (:func:`described`) where it differs from its default.
 """
 
 from __future__ import annotations
@@ -11,7 +15,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -27,6 +31,20 @@ _DIGITS = 6
 _TOLERANCE = 1e-6  # lengths relative to the body's size, and directions, agree within this
 _HASH_LENGTH = 16  # hexadecimal digits
 
+_FORMS = frozenset(
+    {
+        "mesh", "law", "parameters", "loads", "supports", "constants", "fibres", "sheets",
+        "regions", "angles", "stiffness_modes", "dilatation",
+    }
+)  # fmt: skip
+_LEFT_OUT = frozenset(
+    {
+        "name",  # only in messages
+        "origin",  # how the scene was made, which a file need not know
+        "fibre_rule",  # its directions on this mesh are in "fibres"
+    }
+)
+
 
 @dataclass(frozen=True, eq=False)
 class Identity:
@@ -36,7 +54,8 @@ class Identity:
     directions : the unit vectors by name: fibres, sheets and their rotations, if there are any.
     indices : the arrays of whole numbers by name: tetrahedra, prescribed components, regions, facet
         sets under a load or a support.
-    description : the law, constants, loads, springs and the names of the parameters, plain JSON.
+    description : the law, constants, loads, springs, the names of the parameters, and fields
+        without a form of their own, plain JSON.
     """
 
     lengths: Mapping[str, np.ndarray]
@@ -80,8 +99,12 @@ def identity_of(scene: SceneData) -> Identity:
         "springs": sorted(json.dumps(spring) for spring in springs if spring is not None),
         "dilatation": scene.dilatation,
     }
-    if scene.loaded_by:  # scenes at rest keep the fingerprint that saved emulators carry
-        description["loaded_by"] = dict(scene.loaded_by)
+    for field in fields(SceneData):  # one at its default leaves the fingerprints of saved files
+        value = getattr(scene, field.name)
+        if field.name not in _FORMS | _LEFT_OUT and described(value) != described(_default(field)):
+            description[field.name] = described(value)
+    if scene.grips is not None:  # each test of a specimen, a node set, is a path of its grips
+        indices |= {f"nodes {name}": np.unique(nodes) for name, nodes in mesh.node_sets.items()}
     displacements = {f"displacement per unit of {name}": d for name, d in per_unit.items()}
     return Identity(
         lengths={"nodes": mesh.nodes, "displacement": fixed, **displacements},
@@ -111,6 +134,37 @@ def fingerprint(scene: SceneData, identity: Identity) -> str:
         # Lengths mark where each part ends, so that two lists of parts never hash alike.
         digest.update(len(part).to_bytes(8, "little") + part)
     return digest.hexdigest()[:_HASH_LENGTH]
+
+
+def described(value: Any) -> Any:
+    """Return ``value`` as plain JSON that differs where any entry of it does.
+
+    Dataclasses are described by class and by field, arrays by shape and a hash of their rounded
+    values; numbers are floats, and -0.0 is 0.0.
+    """
+    if is_dataclass(value) and not isinstance(value, type):
+        entries = {field.name: described(getattr(value, field.name)) for field in fields(value)}
+        return {"class": type(value).__name__, **entries}
+    if isinstance(value, Mapping):
+        return {str(name): described(entry) for name, entry in value.items()}
+    if isinstance(value, tuple | list):
+        return [described(entry) for entry in value]
+    if value is None or isinstance(value, bool | str):
+        return value
+    if isinstance(value, int | float | np.number):
+        return float(value) + 0.0
+    array = np.asarray(value)
+    if array.dtype.kind not in "biuf":
+        raise TypeError(f"an identity cannot describe a {type(value).__name__}")
+    rounded = np.round(array.astype(float), _DIGITS) + 0.0
+    return [list(array.shape), hashlib.sha256(rounded.tobytes()).hexdigest()[:_HASH_LENGTH]]
+
+
+def _default(field: Field[Any]) -> Any:
+    """Return the default of a field of a scene; None where it has none."""
+    if field.default_factory is not MISSING:
+        return field.default_factory()
+    return None if field.default is MISSING else field.default
 
 
 def _close(a: Mapping[str, np.ndarray], b: Mapping[str, np.ndarray], tolerance: float) -> bool:

@@ -19,7 +19,7 @@ few dozen theta teach polynomials of theta that add it to the stresses of any ma
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import jax
@@ -295,5 +295,7 @@ def of_grips(specimen: Scene) -> str:
     """Return a short hash of a specimen and how it was held."""
     grips = specimen.grips
     assert grips is not None
-    words = (grips.held, grips.hooks, grips.cells, grips.marks)
-    return fingerprint_of("grips", specimen.fingerprint, repr(words), np.asarray(grips.size))
+    apart = ("size", "learned")  # an array of its own, and what the hash is kept with
+    words = tuple(getattr(grips, each.name) for each in fields(grips) if each.name not in apart)
+    free = replace(specimen, grips=None)
+    return fingerprint_of("grips", free.fingerprint, repr(words), np.asarray(grips.size))

@@ -11,6 +11,7 @@ import calibrate as cal
 import emulator as em
 from calibrate.cli import main
 from calibrate.project.experiment import read_experiment
+from calibrate.project.problem import simulator_of
 from calibrate.project.specimen import draft_specimen
 from emulator.core.errors import InputError
 from emulator.scenes.file import read_scene
@@ -168,6 +169,29 @@ def test_what_grips_do_is_learned_by_one_command(gripped, capsys):
     even = cal.stresses(free, "stress_x")(forward(theta), theta)
     assert float(data[0, 0]) == 0.0
     assert 1.01 < float(data[-1, 0] / even[-1, 0]) < 1.3  # a clamped strip is stiffer
+
+
+def test_edited_grips_are_another_scene(gripped):
+    """To simulators, certificates and the posteriors that a folder keeps."""
+    clamped, free = read_scene(gripped / "scene.toml"), read_scene_without_grips(gripped)
+    (gripped / "scene.toml").write_text(GRIPPED.replace("cells = 2", "cells = 2, marks = 2.0"))
+    by_marks = read_scene(gripped / "scene.toml")
+    scenes = clamped, free, by_marks
+    assert len({scene.fingerprint for scene in scenes}) == 3
+    for scene in scenes:
+        assert simulator_of(scene).scene.grips == scene.grips
+
+
+@pytest.mark.slow
+def test_a_posterior_is_refused_after_its_grips_were_edited(gripped, capsys):
+    words = ["--data", "test.csv", "--noise", "stress=0.1", "--no-certify"]
+    assert main(["infer", "scene.toml", *words, "--out", "run"]) == 0
+    assert main(["report", "run"]) == 0
+    (gripped / "scene.toml").write_text(GRIPPED.replace("8.0", "9.0"))
+    capsys.readouterr()
+    for command in ("certify", "report"):
+        assert main([command, "run"]) == 2
+        assert "was made for another scene" in capsys.readouterr().err
 
 
 def read_scene_without_grips(folder):

@@ -9,17 +9,23 @@ from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws import LAWS
 from emulator.mechanics.laws.law import law_identity, probed
 from emulator.scenes import Parameter, Support
-from emulator.scenes.identity import _as_set
+from emulator.scenes.grips import Grips, Learned
+from emulator.scenes.identity import _LEFT_OUT, _as_set, described
 from emulator.scenes.loads import (
     LOADS,
     ActiveTension,
+    FollowerPressure,
     Force,
     Gravity,
     GravityVector,
     Prestress,
     Traction,
 )
+from emulator.scenes.scene_data import SceneData
+from emulator.scenes.specimen import specimen
 from emulator.scenes.supports import SUPPORTS, ElasticSupport
+from emulator.scenes.tissue import FibreAngles
+from emulator.scenes.tube import Tube
 from scene_support import block
 
 
@@ -224,3 +230,140 @@ def test_every_field_of_every_load_and_support_counts(kind):
     assert set(others) == {each.name for each in fields(part)}
     told = {scene(part)} | {scene(replace(part, **{name: v})) for name, v in others.items()}
     assert len(told) == 1 + len(others)
+
+
+LAW = LAWS["holzapfel_ogden_orthotropic"]
+COUNT = len(block().mesh.elements)
+DIRECTIONS = {axis: np.tile(np.eye(3)[k], (COUNT, 1)) for k, axis in enumerate("xyz")}
+LEARNED = Learned(np.zeros((1, 2)), np.zeros((1, 3, 3, 3)), 0.01, "of")
+GRIPS = Grips((10.0, 10.0, 1.0), marks=3.0, learned=LEARNED)
+TUBE = Tube(0.4, (0.1,))
+TURNED = FibreAngles(DIRECTIONS["z"], {"angle": np.ones(COUNT)})
+
+
+def piece(**changes):
+    """Return a scene in which every field can be changed alone."""
+    entries = {
+        "law": LAW,
+        "parameters": (Parameter("a", "kPa", 1.0, 2.0), Parameter("pressure", "kPa", 1.0, 2.0)),
+        "loads": (FollowerPressure("right"),),
+        "fibres": DIRECTIONS["x"],
+        "sheets": DIRECTIONS["y"],
+        "regions": np.arange(COUNT) % 2,
+        "stiffness_modes": np.linspace(-0.1, 0.1, COUNT)[:, None],
+        "constants": {
+            **{name: 1.0 for name in LAW.parameters if name != "a"},
+            **{"stiffness_0": 1.0, "stiffness_1": 1.0, "stiffness_mode_1": 0.0},
+        },
+    } | changes
+    for name, value in ("angle", entries.get("angles")), ("imaged", entries.get("loaded_by")):
+        if value:
+            entries["constants"] = entries["constants"] | {name: 0.5}
+    return replace(block(), **entries)
+
+
+def specimen_of(**changes):
+    held = {"parameters": (Parameter("a", "kPa", 1.0, 2.0),), "loads": (), "grips": GRIPS}
+    return piece(**held | changes)
+
+
+# Another value of every field of a scene; a field that is neither here nor an exception fails.
+MESH = block().mesh
+FIELDS = {
+    "mesh": replace(MESH, nodes=1.1 * MESH.nodes),
+    "law": replace(LAW, energy=lambda strain, *theta: 2.0 * LAW.energy(strain, *theta)),
+    "parameters": (Parameter("a", "kPa", 1.0, 3.0), Parameter("pressure", "kPa", 1.0, 2.0)),
+    "loads": (FollowerPressure("top"),),
+    "supports": (Support("bottom"),),
+    "constants": piece().constants | {"b": 2.0},
+    "fibres": DIRECTIONS["z"],
+    "sheets": DIRECTIONS["z"],
+    "regions": (np.arange(COUNT) + 1) % 2,
+    "stiffness_modes": np.linspace(0.1, 0.2, COUNT)[:, None],
+    "angles": (TURNED,),
+    "dilatation": "patch",
+    "loaded_by": {"pressure": "imaged"},
+    "tube": TUBE,
+}
+# The same of what a field of a scene consists of.
+PARTS_OF_FIELDS = {
+    "tube": (
+        TUBE,
+        {"inner_radius": 0.8, "layers": (0.05, 0.05), "opening_angle": 20.0, "points": 6},
+    ),
+    "grips": (
+        GRIPS,
+        {
+            "size": (10.0, 10.0, 2.0),
+            "held": "hooks",
+            "hooks": 4,
+            "cells": 6,
+            "marks": None,
+            "learned": None,
+        },
+    ),
+    "learned": (
+        LEARNED,
+        {
+            "degrees": np.ones((1, 2)),
+            "shares": np.ones((1, 3, 3, 3)),
+            "error": 0.02,
+            "of": "another",
+        },
+    ),
+    "angles": (
+        TURNED,
+        {"axis": DIRECTIONS["x"], "shares": {"angle": np.linspace(0.0, 1.0, COUNT)}},
+    ),
+}
+
+
+def test_every_field_of_a_scene_counts():
+    assert set(FIELDS) | {"grips"} | _LEFT_OUT == {each.name for each in fields(SceneData)}
+    scenes = [piece(), *(piece(**{name: value}) for name, value in FIELDS.items())]
+    assert len({scene.fingerprint for scene in scenes}) == len(scenes)
+    assert not any(scenes[0].identity.agrees(scene.identity) for scene in scenes[1:] if
+                   scene.parameters == scenes[0].parameters)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PARTS_OF_FIELDS)
+def test_every_part_of_a_field_counts(name):
+    part, others = PARTS_OF_FIELDS[name]
+    assert set(others) == {each.name for each in fields(part)}
+
+    def scene(value):
+        if name == "angles":
+            return piece(angles=(value,))
+        if name == "tube":
+            return piece(tube=value)
+        return specimen_of(grips=value if name == "grips" else replace(GRIPS, learned=value))
+
+    told = {scene(part).fingerprint}
+    told |= {scene(replace(part, **{field: v})).fingerprint for field, v in others.items()}
+    assert len(told) == 1 + len(others)
+
+
+def test_tests_of_a_gripped_specimen_count():
+    sets = MESH.node_sets
+    named = replace(MESH, node_sets={**sets, "pull": sets["right"]})
+    assert specimen_of().fingerprint != specimen_of(mesh=named).fingerprint
+    assert piece().fingerprint == piece(mesh=named).fingerprint
+
+
+def test_scenes_without_grips_keep_the_fingerprint_that_saved_files_carry():
+    assert em.scenes.once_clamped_beam(order=1).fingerprint == "a963beb3023c18b0"
+    assert em.scenes.once_clamped_beam().fingerprint == "7ea647097ea5c9ad"
+    strip = specimen(
+        {"stretch_x": np.array([1.0, 1.05, 1.1])},
+        law=LAWS["neo_hookean"],
+        parameters=(Parameter("mu", "kPa", 5.0, 20.0), Parameter("lam", "kPa", 1.0, 100.0)),
+    )
+    assert strip.fingerprint == "d262dd0036477a7d"
+    assert len({replace(strip, grips=g).fingerprint for g in (None, GRIPS)}) == 2
+
+
+def test_an_identity_refuses_what_it_cannot_describe():
+    with pytest.raises(TypeError, match="cannot describe a object"):
+        described(object())
+    assert described(np.array([0.0, np.nan])) != described(np.array([np.nan, 0.0]))
+    assert described((1, -0.0)) == described([1.0, 0.0])

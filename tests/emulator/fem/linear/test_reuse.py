@@ -1,12 +1,18 @@
 """A factor that serves other tangents."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import emulator as em
+from emulator.accuracy.estimate import ErrorBar
 from emulator.fem.linear import Outcome
 from emulator.fem.linear.reuse import KeptFactor, conjugate_gradients
+from emulator.geometry.generators.box import box
+from emulator.scenes import Support
+from scene_support import block
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +51,60 @@ def test_two_iterations_are_those_of_the_textbook():
     )
     np.testing.assert_allclose(found.x, x, rtol=1e-10)
     assert found.convex
+
+
+@pytest.fixture
+def any_mesh_is_large(monkeypatch):
+    """Every mesh keeps a factor, as those of 100 000 unknowns and more do."""
+    monkeypatch.setattr("emulator.fem.linear.reuse._LARGE", 50)
+
+
+def column(shortening):
+    """A slender column between plates: straight it buckles at 0.8 %."""
+    return replace(
+        block(),
+        mesh=box((20.0, 1.0, 1.0), (16, 2, 2)),
+        supports=(Support("left"), Support("right", (-20.0 * shortening, 0.0, 0.0))),
+    )
+
+
+@pytest.mark.parametrize(("shortening", "stable"), [(0.0005, True), (0.15, False)])
+def test_stability_is_seen_beside_a_kept_factor(any_mesh_is_large, shortening, stable):
+    scene = column(shortening)
+    simulator = em.Simulator(scene)
+    solution = simulator.solve(scene.centre)
+    assert solution.converged
+    assert simulator.system.kept is not None
+    for _ in range(2):  # a factor is there from the second time on at the latest
+        assert simulator.is_stable(solution.displacement, scene.centre) is stable
+    assert simulator.is_stable(em.Simulator(column(0.0005))(scene.centre), scene.centre)
+
+
+def test_answers_beside_a_kept_factor_are_those_without(monkeypatch):
+    """Every question that is put to a simulator, asked of two theta in turn."""
+    scene = em.scenes.left_ventricle(4, 8, 1, order=1)
+    thetas = scene.from_unit(jnp.array([[0.5] * 5, [0.6, 0.4, 0.5, 0.55, 0.5]]))
+
+    def answers():
+        simulator = em.Simulator(scene)
+        path = simulator.path(thetas)
+        volume = simulator.gradient_of(lambda u, theta: jnp.sum(u**2))
+        found = []
+        for theta, u in zip(thetas, path.displacement, strict=True):
+            start = simulator.solve(theta, 0.9 * u).displacement
+            slopes, gradient = simulator.sensitivities(u, theta), volume(u, theta)
+            bar = ErrorBar(em.fem_forward(simulator), simulator)
+            step = bar.of_field(0.99 * u, theta)
+            found += [u, start, slopes, *gradient, simulator.reactions(u, theta), step.field]
+        return simulator, found
+
+    usual, expected = answers()
+    monkeypatch.setattr("emulator.fem.linear.reuse._LARGE", 50)
+    keeping, found = answers()
+    assert usual.system.kept is None
+    assert keeping.system.kept is not None
+    for one, other in zip(expected, found, strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-6, atol=1e-6 * float(jnp.abs(one).max()))
 
 
 def test_a_kept_factor_leads_to_the_same_equilibrium(monkeypatch):
