@@ -43,7 +43,7 @@ from calibrate.posterior import Posterior
 from calibrate.posterior.diagnosis import MAP_ERRORS, MAP_MOVES
 from calibrate.posterior.posterior import make_tree
 from calibrate.samplers.diagnostics import effective, normalised
-from calibrate.samplers.laplace import MISSED_AT, MISSED_BY
+from calibrate.samplers.modes import MISSED_AT, MISSED_BY
 from calibrate.samplers.proposals import MOST_TEMPERED, Kernels, key_from, tempered
 from calibrate.statistical_model import FEMLikelihood
 from emulator.core.display import Stages, counting

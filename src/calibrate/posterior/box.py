@@ -23,7 +23,8 @@ In a wider box the mean would move by
 .. math:: \Delta = \frac{M_+ (m_+ - \bar x) + M_- (m_- - \bar x)}{1 + M_+ + M_-}
 
 where :math:`E` is three sd of the draws along :math:`d`, or less where a box that is wider by half
-on each side ends (:meth:`Parameter.wider`). The directions are the axes and the
+on each side ends (:meth:`Parameter.wider`). Where far fewer draws are at the exit than the fit
+says, as between separate modes and an end, the end is none. The directions are the axes and the
 principal axes of the draws. A posterior that is about as wide as the box along :math:`d` is left
 open by the data; it claims nothing there.
 """
@@ -46,6 +47,7 @@ _OPEN = 0.8  # posterior sd over the box's, above which the data leave a directi
 _NEAR = 0.9  # quantile of the distances up to which their density is fitted
 _FAR = 3.0  # posterior sd to which a density is continued, and the largest shift that is meant
 _OFTEN = 0.1  # share of the draws nearest to the exit that leave at an end which is named
+_AT, _TOO_MANY = 10, 3.0  # draws at the exit, and how many times as many the fit may say there are
 _STEEPEST = 50.0  # slope and curvature of the fitted log density, in units of 1 / T
 _NODES, _WEIGHTS = (0.5 * x for x in np.polynomial.legendre.leggauss(48))  # on -1/2 to 1/2
 _NODES += 0.5
@@ -151,6 +153,11 @@ def _exit(x: np.ndarray, d: np.ndarray, wider: np.ndarray, farthest: float) -> _
     if not (T > 0.0 and E > 0.0):
         return _Exit(0.0, 0.0, ())
     log_norm, alpha, beta = _fit(t[t <= T] / T)
+    count = min(max(_AT, len(t) // 1000), len(t))
+    edge = float(np.partition(t, count - 1)[count - 1]) / T
+    density = np.exp(-alpha * edge * _NODES - beta * (edge * _NODES) ** 2 - log_norm)
+    if len(t) * _NEAR * edge * float(_WEIGHTS @ density) > _TOO_MANY * count:
+        return _Exit(0.0, 0.0, ())
     r = E / T * _NODES
     outside = np.exp(np.minimum(alpha * r - max(beta, 0.0) * r**2 - log_norm, _STEEPEST))
     outside *= _WEIGHTS * E / T * _NEAR

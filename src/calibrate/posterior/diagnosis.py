@@ -30,7 +30,8 @@ from calibrate.arviz import base, stats
 from calibrate.posterior.box import BoxEnd, in_words
 from calibrate.samplers import diagnostics as limits
 from calibrate.samplers import r_hat
-from calibrate.samplers.laplace import MISSED_AT, MISSED_BY
+from calibrate.samplers.importance import SEEN_ONCE
+from calibrate.samplers.modes import MISSED_AT, MISSED_BY
 
 # Attributes of a run, as JSON: errors of the map at its draws, and sentences on noises by default.
 MAP_ERRORS, SCALED_NOISE = "map_errors", "scaled_noise"
@@ -212,6 +213,11 @@ def diagnose(
         yield (
             f"the weights of importance sampling have a heavy tail, Pareto k {k:.2f} (at most "
             f"{limits.LARGEST_PARETO_SHAPE}): use another sampler, such as nuts"
+        )
+    if (once := int(attributes.get(SEEN_ONCE, 0))) > 0:
+        yield (
+            f"{once} of {int(attributes['modes'])} modes were seen by one population only, so that "
+            "others may be missing: sample more (--chains), or take a prior that leaves some out"
         )
     place, lighter = attributes.get(MISSED_AT), attributes.get(MISSED_BY)
     if place is not None and lighter is not None:

@@ -24,7 +24,7 @@ from calibrate.provenance import as_attributes, versions
 from calibrate.samplers import check_options, density_of, find_sampler, named_draws
 from calibrate.samplers.checkpoint import Checkpoint, identity_of
 from calibrate.samplers.density import prior_draws
-from calibrate.samplers.laplace import MISSED_BY, STARTS, find_modes, missed_mode
+from calibrate.samplers.modes import MISSED_BY, MOST, MOST_BY_FEM, Modes, explore, missed_mode
 from calibrate.samplers.protocol import Context
 from calibrate.state_names import split
 from calibrate.statistical_model import Data, Model
@@ -250,8 +250,10 @@ def sample(
     if MISSED_BY not in attributes:
         z = np.asarray(run.z).reshape(-1, density.dimension)
         key = jax.random.fold_in(jax.random.key(seed), _MODES)
-        modes = find_modes(density, checked, prior_draws(density, key, STARTS), z)
-        attributes |= missed_mode(density, checked, z, modes)
+        starts = prior_draws(density, key, MOST if density.batches else MOST_BY_FEM)
+        modes = explore(density, checked, starts, z)
+        places = Modes([mode.z for mode in modes], [mode.height for mode in modes])
+        attributes |= missed_mode(density, checked, z, places)
     rng_key = jax.random.fold_in(jax.random.key(seed), _PREDICTIONS) if predictions else None
     draws = named_draws(model, run.z)
     tree = make_tree(model, checked, draws, run.statistics, rng_key)

@@ -9,7 +9,7 @@ transition of all chains would take as many gradients as the longest trajectory 
 (docs/experiments.md, "NUTS chains one after the other", "Chains on threads").
 
 A pilot run tells too little of many unknowns. There the chains run in coordinates that are white
-at a mode (:func:`calibrate.samplers.laplace.white_at_mode`), where there is one.
+at a mode (:func:`calibrate.samplers.modes.white_at_mode`), where there is one.
 
 Chains start at random points, within two units of the centre.
 """
@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibrate.samplers.density import Density, Target, prior_draws
-from calibrate.samplers.laplace import white_at_mode
+from calibrate.samplers.modes import white_at_mode
 from calibrate.samplers.protocol import ChainOptions, Context, Draws, Kernel, Sampler, in_rounds
 from calibrate.samplers.transport import (
     StandardMap,

@@ -10,10 +10,14 @@ proportional to :math:`w_i^\beta`, and fresh points are drawn from this next pro
 The power :math:`\beta` is the largest at which a given number of points counts. With an eighth of
 the points the density of a step is at most some eight times that of the one before, so that several
 modes stay in, and ten steps contract it by :math:`10^9`. Points of earlier steps are let go: the
-time of a step is the same at every contraction. A population that is not there after three steps
-has some of its points climb the density by its gradient, and half of the next kernels are put
-beside the modes they reach: near a sharp ridge tempering alone takes dozens of steps. At
-:math:`\beta = 1` the proposal is fitted, twice or more, and fresh points of the last one, drawn
+time of a step is the same at every contraction.
+
+Shares of modes drift from step to step, and a light mode may die. So some points of the prior and
+of the first steps climb the density by its gradient (:mod:`calibrate.samplers.modes`), and kernels
+are put at the modes they reach, half of all on the way and a quarter in a fit. Near a sharp ridge,
+where tempering alone takes dozens of steps, that is also the shorter way.
+
+At :math:`\beta = 1` the proposal is fitted, twice or more, and fresh points of the last one, drawn
 after it was chosen, are weighted until they are worth twice the draws asked for: :math:`n = (\sum
 w_i)^2 / \sum w_i^2`. The :math:`m` draws are resampled from these points with probability
 proportional to :math:`w_i`; equal ones occur. The variance of a mean of draws is that of the points
@@ -22,9 +26,14 @@ two thirds of :math:`m` or more. Every weight is of the model's own density, so 
 approximated but by the number of points. The mean of the weights is the evidence.
 
 Independent populations take the place of chains: their R-hat shows whether they found the same
-posterior. Where they did not, because a mode is hard to find, or where a tail is heavy, each is
-fitted once more to the weighted points of all. The Pareto shape of the weights' tail (Vehtari et
+posterior. While a heavy mode was seen by one of them only, or reached by a few climbs, others may
+be unseen, and more populations search, up to twelve; what is then still likely to be unseen is
+told. Where not all saw all modes, or where a tail is heavy, each is fitted once more to the
+weighted points of all, and at the modes of all. The Pareto shape of the weights' tail (Vehtari et
 al. 2024) shows whether the proposal covers it.
+
+A mode that has no basin to climb from is found by nothing: a spike beside a broad mode, narrower
+than the distance between points of the prior.
 
 The sampler by default, ``auto``, takes these draws where unknowns are few, the forward map is fast
 in batches, populations agree and the tail is light, and those of NUTS elsewhere.
@@ -49,9 +58,21 @@ from calibrate.samplers.diagnostics import (
     normalised,
     pareto_shape,
 )
-from calibrate.samplers.laplace import draws_beside, find_modes
+from calibrate.samplers.modes import (
+    MOST,
+    Mode,
+    Modes,
+    explore,
+    heavy,
+    merged,
+    missed_mode,
+    of_account,
+    shares,
+    unseen,
+)
 from calibrate.samplers.nuts import NUTS, NUTSOptions
 from calibrate.samplers.proposals import (
+    Group,
     Kernels,
     effective_number,
     key_from,
@@ -59,7 +80,6 @@ from calibrate.samplers.proposals import (
     tempered,
 )
 from calibrate.samplers.protocol import Context, Draws, Options, Sampler, in_rounds
-from calibrate.samplers.smc import evidence
 from calibrate.statistical_model import Data
 from emulator.core.display import counting
 from emulator.core.errors import SolverError
@@ -72,8 +92,9 @@ _FEWEST = 512  # points of a step
 _PRIOR = 2.0  # draws of the prior, for one point of a step
 _FOUND = 200.0  # effective points from which a proposal is fitted
 _MOST_STEPS = 25
-# Steps after which a population looks for modes by the gradient, and points that climb to them.
-_PATIENCE, _CLIMBERS = 3, 8
+_PATIENCE = 3  # steps after which a population looks for modes by the gradient
+# Attributes of a run: modes that one population alone saw, and the number that none may have seen.
+SEEN_ONCE, UNSEEN = "modes_seen_once", "modes_unseen"
 _ONE_CLIMBS = Lock()  # at a time, so that the gradient is compiled once
 _FITS, _MOST_FITS = 2, 6
 _LIGHT = 0.5  # Pareto shape of the weights of a good fit: their variance is finite
@@ -83,6 +104,13 @@ _FRESH = 2048  # points at a time from a fitted proposal
 _WORTH = 2.0  # independent draws that the points are worth, for one that is resampled from them
 _CENTRES, _WIDTHS, _FREEDOM = 512, (0.5, 1.0), 5.0  # of a fitted proposal
 _NARROW = (0.25, 0.5)  # of a step's: wide kernels in many dimensions undo its contraction
+_ON_THE_WAY, _IN_A_FIT = 0.5, 0.25  # share of the kernels that are put beside modes
+_AT_MODE = 1.2  # width of the wider kernels at a mode, over its sd
+_FEWEST_CENTRES = 8  # kernels at a mode
+_MOST_FRESH = 4.0  # times the usual number of points where modes are many
+_MOST_POPULATIONS = 12
+_REACHED = 5  # climbs that end at each heavy mode where the look for modes was thorough
+_HOLDS = 0.2  # share of its mass from which points hold a mode
 
 
 @dataclass(frozen=True)
@@ -157,14 +185,20 @@ class _Run:
         self.points = Population(z, at, at.prior)
         if not np.isfinite(self.points.log_weights).any():
             raise SolverError("the posterior density is zero at every draw of the prior")
+        self.modes: list[Mode] = []
+        # Of climbs: half of all are draws of the prior, where each mode still has its basin.
+        self._starts = [z[self._rng.choice(len(z), size=MOST)]]
 
     def search(self) -> None:
         """Move from the prior to the posterior, and fit a proposal there."""
+        looked = False
         for step in range(_MOST_STEPS):  # one step at least: proposals are better than the prior
             z, weights = self.points.z, tempered(self.points.log_weights, self._tempered)
-            if step == _PATIENCE and weights.any():
-                z, weights = self._and_modes(z, weights)
-            self._go_to(z, weights, _CHOSEN, _NARROW, self._step)
+            if weights.any():
+                self._starts.append(z[self._rng.choice(len(z), size=MOST, p=weights)])
+                if step == _PATIENCE:
+                    looked = self._look()
+            self._go_to(z, weights, _CHOSEN, _NARROW, self._step, _ON_THE_WAY)
             if (worth := effective_number(self.points.log_weights)) >= _FOUND:
                 break
         else:
@@ -172,38 +206,83 @@ class _Run:
                 f"importance: the points of a population are worth {worth:.0f} draws after "
                 f"{self.evaluations} evaluations; use nuts or smc"
             )
+        if not looked:
+            self._look()
+        self.settle()
+
+    def _look(self) -> bool:
+        """Find modes by climbs from draws of the prior and from points of the steps, in turn."""
+        prior, *steps = self._starts
+        of_steps = np.stack(steps, axis=1).reshape(-1, self._density.dimension)[:MOST]
+        starts = np.stack([prior, of_steps], axis=1).reshape(-1, self._density.dimension)[:MOST]
+        with _ONE_CLIMBS:
+            self.modes = explore(self._density, self._data, starts, self._starts[-1])
+        return True
+
+    def settle(self) -> None:
+        """Fit the proposal to the points until their weights have a light tail."""
         for fits in range(1, _MOST_FITS + 1):
             self.fit(self.points.z, self.points.log_weights)
             if fits >= _FITS and pareto_shape(self.points.log_weights) < _LIGHT:
                 break
 
-    def _and_modes(self, z: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return points z (s, p) and weights, half of them for draws beside the modes uphill."""
-        chosen = z[resampled(weights, _CHOSEN, self._rng)]
-        with _ONE_CLIMBS:
-            modes = find_modes(self._density, self._data, chosen[:_CLIMBERS], chosen)
-            count = _CHOSEN // _CLIMBERS
-            beside = draws_beside(self._density, self._data, modes, count, self._rng)
-        if not len(beside):
-            return z, weights
-        shares = np.full(len(beside), 1.0 / len(beside))
-        return np.concatenate([z, beside]), 0.5 * np.concatenate([weights, shares])
-
     def fit(self, z: np.ndarray, log_weights: np.ndarray) -> None:
         """Go to fresh points from kernels around weighted points z (s, p)."""
-        self._go_to(z, normalised(log_weights), _FITTED_TO, _WIDTHS, _FRESH)
+        modes = of_account(self.modes)
+        beside = _IN_A_FIT if len(modes) > 1 else 0.0
+        fresh = round(_FRESH * min(_MOST_FRESH, 1.0 + 0.25 * max(len(modes) - 1, 0)))
+        self._go_to(z, normalised(log_weights), _FITTED_TO, _WIDTHS, fresh, beside)
 
     def _go_to(
-        self, z: np.ndarray, weights: np.ndarray, chosen: int, widths: tuple[float, ...], count: int
+        self,
+        z: np.ndarray,
+        weights: np.ndarray,
+        chosen: int,
+        widths: tuple[float, ...],
+        count: int,
+        beside: float,
     ) -> None:
-        """Go to ``count`` fresh points from kernels around points z (s, p) chosen by weight."""
+        """Go to ``count`` fresh points from kernels around points z (s, p) chosen by weight.
+
+        beside : the share of the kernels that are put beside modes, if there are any.
+        """
         if not weights.any():
             raise SolverError(
                 "importance: the posterior density is zero at every point of a step; use nuts"
             )
         around = z[self._rng.choice(len(z), size=chosen, p=weights)]
-        proposal = Kernels.around(around, widths, _FREEDOM, self._rng, centres=_CENTRES)
-        self.points = self._drawn(proposal, count)
+        self.points = self._drawn(self._kernels(around, widths, beside), count)
+
+    def _kernels(self, around: np.ndarray, widths: tuple[float, ...], beside: float) -> Kernels:
+        """Return kernels around points (s, p), those nearest to each mode apart, and at modes.
+
+        No mode has fewer kernels than a quarter of an equal share: light ones stay in.
+        """
+        modes = of_account(self.modes) if beside else []
+        if not modes:
+            return Kernels.around(around, widths, _FREEDOM, self._rng, centres=_CENTRES)
+        nearest = np.argmin([mode.distances(around) for mode in modes], axis=0)
+        numbers = np.bincount(nearest, minlength=len(modes)) / len(around)
+        numbers = _CENTRES * (1.0 - beside) * np.maximum(numbers, 0.25 / len(modes))
+        few, groups = 4 * (around.shape[1] + 1), list[Group]()
+        for k, mode in enumerate(modes):
+            part, centres = around[nearest == k], max(round(numbers[k]), _FEWEST_CENTRES)
+            if len(part) >= few:
+                kernels = Kernels.around(part, widths, _FREEDOM, self._rng, centres=centres)
+                groups += kernels.groups
+            centres = max(round(_CENTRES * beside / len(modes)), _FEWEST_CENTRES)
+            groups.append(Group.at_mode(mode.z, _AT_MODE / max(widths) * mode.root, centres))
+        return Kernels(tuple(groups), widths, _FREEDOM)
+
+    def sees(self, mode: Mode, share: float) -> bool:
+        """Return whether a climb of this population ended at a mode, or its points hold it.
+
+        share : the share of the mode in the mass of all.
+        """
+        if any(own.is_at(mode.z, mode.height) for own in self.modes):
+            return True
+        inside = mode.distances(self.points.z) < len(mode.z) + 4.0 * np.sqrt(2.0 * len(mode.z))
+        return float(normalised(self.points.log_weights)[inside].sum()) > _HOLDS * share
 
     def _drawn(self, proposal: Kernels, count: int) -> Population:
         z = proposal.sample(self._rng, count)
@@ -240,6 +319,27 @@ def _of_all(runs: list[_Run]) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([points.z for points in populations]), np.concatenate(log_weights)
 
 
+def _evidence(populations: list[Population]) -> dict[str, float]:
+    r"""Return attributes: the log of the mean evidence of populations, and its standard error.
+
+    The variance of a mean weight is told by the weights, :math:`1 / n - 1 / s` of the square for
+    :math:`s` points that are worth :math:`n`, and by how the populations differ; the larger counts.
+    """
+    logarithms = np.array([points.log_evidence for points in populations])
+    shifted, count = np.exp(logarithms - logarithms.max()), len(logarithms)
+    mean = shifted.mean()
+    within = [
+        (z / mean) ** 2 * (1.0 / effective_number(points.log_weights) - 1.0 / len(points.z))
+        for z, points in zip(shifted, populations, strict=True)
+    ]
+    between = shifted.var(ddof=1) / mean**2 if count > 1 else 0.0
+    error = np.sqrt(max(np.mean(within), between) / count)
+    return {
+        "log_evidence": float(logarithms.max() + np.log(mean)),
+        "log_evidence_error": float(error),
+    }
+
+
 class ImportanceSampling(Sampler):
     """The sampler of adaptive importance sampling."""
 
@@ -251,7 +351,9 @@ class ImportanceSampling(Sampler):
         The attribute ``log_evidence`` is the logarithm of the populations' mean evidence,
         ``log_evidence_error`` its standard error, ``weights_pareto_k`` the largest Pareto shape of
         a population's weights, ``evaluations`` those of the density in all, and
-        ``effective_points`` the number of independent draws that all points are worth.
+        ``effective_points`` the number of independent draws that all points are worth. ``modes`` is
+        the number of heavy modes, ``modes_seen_once`` that of those which one population alone
+        saw, and ``modes_unseen`` an estimate of the number that none did.
 
         Raises
         ------
@@ -259,9 +361,7 @@ class ImportanceSampling(Sampler):
             The density is zero wherever the prior was drawn, or a population did not come to the
             posterior within ``options.evaluations``.
         """
-        # One after the other, so that programs are compiled once; each is a thread from there on.
-        seeds = ([context.seed, k] for k in range(options.chains))
-        runs = [_Run(density, data, options, seed) for seed in seeds]
+        runs, modes, counts = list[_Run](), list[Mode](), list[int]()
         with (
             counting(desc=self.name, total=options.chains, disable=not context.progress) as bar,
             ThreadPoolExecutor(min(density.at_once, options.chains)) as pool,
@@ -272,22 +372,50 @@ class ImportanceSampling(Sampler):
                 bar.update()
 
             def draw(total: int) -> Draws:
-                z, lp = zip(*pool.map(lambda run: run.draw(total), runs), strict=True)
+                drawn = pool.map(lambda run: run.draw(total), runs[: options.chains])
+                z, lp = zip(*drawn, strict=True)
                 return Draws(np.stack(z), {"lp": np.stack(lp)})
 
-            list(pool.map(search, runs))
+            # One is made after the other, so that programs are compiled once.
+            while not runs or (
+                len(runs) < _MOST_POPULATIONS
+                and (1 in counts or any(mode.climbs < _REACHED for mode in heavy(modes)))
+            ):
+                last = len(runs) + (2 if runs else options.chains)
+                seeds = ([context.seed, k] for k in range(len(runs), last))
+                new = [_Run(density, data, options, seed) for seed in seeds]
+                list(pool.map(search, new))
+                runs += new
+                modes = merged(mode for run in runs for mode in run.modes)
+                part = dict(zip(range(len(modes)), shares(modes), strict=True))
+                counts = [
+                    sum(run.sees(mode, part[k]) for run in runs)
+                    for k, mode in enumerate(heavy(modes))
+                ]
             draws = draw(options.draws)
+            complete = all(count == len(runs) for count in counts)
             light = _largest_shape(runs) <= LARGEST_PARETO_SHAPE
-            if not (light and converged(draws.z, options.r_hat, options.ess)):
+            if not (complete and light and converged(draws.z, options.r_hat, options.ess)):
                 z, log_weights = _of_all(runs)
-                list(pool.map(lambda run: run.fit(z, log_weights), runs))
+
+                def fit(run: _Run) -> None:
+                    run.modes = modes
+                    run.fit(z, log_weights)
+                    run.settle()
+
+                list(pool.map(fit, runs))
                 draws = in_rounds(draw, options)
         attributes: dict[str, Any] = {
             "weights_pareto_k": _largest_shape(runs),
             "evaluations": int(sum(run.evaluations for run in runs)),
             "effective_points": float(sum(effective_number(r.points.log_weights) for r in runs)),
-            **evidence(np.array([run.points.log_evidence for run in runs])),
+            "modes": len(counts),
+            SEEN_ONCE: counts.count(1),
+            UNSEEN: unseen(counts),
+            **_evidence([run.points for run in runs]),
         }
+        places = Modes([mode.z for mode in modes], [mode.height for mode in modes])
+        attributes |= missed_mode(density, data, draws.z.reshape(-1, density.dimension), places)
         return draws._replace(attributes=attributes)
 
 

@@ -58,12 +58,14 @@ class Group(NamedTuple):
 
     map_ : the transport map from straightened coordinates to z.
     centres : the centres (k, p), straightened.
-    root : the Cholesky factor (p, p) of the covariance.
+    root : the factor R (p, p) of the covariance, R R^T.
+    count : the number of kernels, as many at each centre.
     """
 
     map_: transport.TransportMap
     centres: np.ndarray
     root: np.ndarray
+    count: int
 
     @classmethod
     def of(cls, z: np.ndarray, centres: int) -> Group:
@@ -73,21 +75,26 @@ class Group(NamedTuple):
         covariance = np.atleast_2d(np.cov(straight, rowvar=False))
         # A coordinate that does not vary still gets a width, so that the density exists.
         root = np.linalg.cholesky(covariance + np.diag(1e-9 * np.diag(covariance) + 1e-12))
-        return cls(map_, straight[:centres], root)
+        return cls(map_, straight[:centres], root, len(straight[:centres]))
+
+    @classmethod
+    def at_mode(cls, z: np.ndarray, root: np.ndarray, count: int) -> Group:
+        """Return ``count`` kernels at z (p,), of covariance R R^T with R = ``root`` (p, p)."""
+        return cls(transport.standard_identity(len(z)).bend, z[None], root, count)
 
     def at(self, rows: np.ndarray, steps: np.ndarray) -> np.ndarray:
         """Return points z (s, p) at white ``steps`` (s, p) from the centres ``rows`` (s,)."""
         return transport.bend(self.map_, self.centres[rows] + steps @ self.root.T)
 
     def log_sums(self, z: np.ndarray, widths: Sequence[float], freedom: float) -> np.ndarray:
-        """Return the logarithm (s,) of the sum of all kernels at points z (s, p)."""
+        """Return the logarithm (s,) of the sum of the kernels at points z (s, p)."""
         p, nu = z.shape[1], freedom
         whiten = np.linalg.inv(self.root).T
         points, centres = transport.straighten(self.map_, z) @ whiten, self.centres @ whiten
         square = (points**2).sum(axis=1)[:, None] + (centres**2).sum(axis=1)
         square = np.maximum(square - 2.0 * points @ centres.T, 0.0)
         norm = gammaln(0.5 * (nu + p)) - gammaln(0.5 * nu) - 0.5 * p * np.log(nu * np.pi)
-        norm -= np.log(np.diag(self.root)).sum()
+        norm += np.log(self.count / len(centres)) - np.linalg.slogdet(self.root)[1]
         # Sums of powers, not of exponentials of logarithms: Student's tails do not underflow.
         tails = [(1.0 + square / (nu * h**2)) ** (-0.5 * (nu + p)) / h**p for h in widths]
         return norm + np.log(sum(t.sum(axis=1) for t in tails))
@@ -142,7 +149,7 @@ class Kernels:
     @property
     def sizes(self) -> list[int]:
         """Number of kernels of each group."""
-        return [len(group.centres) for group in self.groups]
+        return [group.count for group in self.groups]
 
     def sample(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """Return points z (count, p)."""
@@ -153,7 +160,7 @@ class Kernels:
         z = scale * rng.normal(size=(count, self.groups[0].centres.shape[1]))
         for group, begin, end in zip(self.groups, [0, *ends], ends, strict=False):
             own = (rows >= begin) & (rows < end)
-            z[own] = group.at(rows[own] - begin, z[own])
+            z[own] = group.at((rows[own] - begin) % len(group.centres), z[own])
         return z
 
     def log_density(self, z: np.ndarray) -> np.ndarray:

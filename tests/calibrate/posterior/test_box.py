@@ -171,3 +171,33 @@ def test_a_cut_posterior_is_not_advised_to_narrow_a_prior():
     ends = one(normal(2.0, 0.05))
     for box, words in ((ends, "widen the box"), ((), "a prior that leaves out")):
         assert any(words in sentence for sentence in diagnose(draws, diverging, row, {}, box))
+
+
+def apart(rng, sd):
+    """Posteriors of several modes, an arc and an L, nine sd or more from every end."""
+    square = np.array([[0.25, 0.25], [0.25, 0.75], [0.75, 0.25], [0.75, 0.75]])
+    for upper in (0.5, 0.8, 0.95):
+        low = rng.random(4000) > upper
+        yield np.column_stack([np.where(low, 0.25, 0.75), np.full(4000, 0.5)])
+    yield square[rng.integers(3, size=4000)]
+    s = rng.random(4000)
+    yield 0.5 + 0.3 * np.column_stack([np.cos(1.5 * np.pi * s), np.sin(1.5 * np.pi * s)])
+    yield np.where((s < 0.5)[:, None], np.column_stack([0.2 + s, 0 * s + 0.3]),
+                   np.column_stack([0 * s + 0.3, s - 0.2]))  # fmt: skip
+
+
+@pytest.mark.parametrize("sd", [0.003, 0.01, 0.02])
+def test_an_end_without_a_draw_near_it_ends_nothing(sd):
+    rng = np.random.default_rng(3)
+    box = {name: Parameter(name, "kPa", 1.0, 2.0) for name in "ab"}
+    for places in apart(rng, sd):
+        x = 1.0 + places + sd * rng.normal(size=places.shape)
+        assert box_ends({"a": x[:, 0], "b": x[:, 1]}, box) == []
+
+
+def test_a_mode_that_is_cut_ends_there_beside_one_that_is_not():
+    rng = np.random.default_rng(4)
+    box = {"a": Parameter("a", "kPa", 1.0, 2.0)}
+    cut = 1.0 + np.abs(0.02 * rng.normal(size=2000))
+    (end,) = box_ends({"a": np.concatenate([cut, 1.2 + 0.02 * rng.normal(size=2000)])}, box)
+    assert (end.name, end.value) == ("a", 1.0)

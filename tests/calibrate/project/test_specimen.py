@@ -184,7 +184,15 @@ def test_edited_grips_are_another_scene(gripped):
 
 @pytest.mark.slow
 def test_a_posterior_is_refused_after_its_grips_were_edited(gripped, capsys):
-    words = ["--data", "test.csv", "--noise", "stress=0.1", "--no-certify"]
+    words = [
+        "--data",
+        "test.csv",
+        "--noise",
+        "stress_x=0.1",
+        "--forward",
+        "incompressible",
+        "--no-certify",
+    ]
     assert main(["infer", "scene.toml", *words, "--out", "run"]) == 0
     assert main(["report", "run"]) == 0
     (gripped / "scene.toml").write_text(GRIPPED.replace("8.0", "9.0"))

@@ -1,29 +1,14 @@
-"""The Laplace approximation: exact for a Gaussian posterior, and honest about others.
-
-Modes that draws have missed are reported; funnels, ridges and light modes are not.
-"""
+"""The Laplace approximation: exact for a Gaussian posterior, and honest about others."""
 
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
 import pytest
-from numpyro.distributions import Normal
 
 import calibrate as cal
-from calibrate.posterior.diagnosis import diagnose
-from calibrate.samplers import Density, LaplaceOptions
-from calibrate.samplers.density import prior_draws
-from calibrate.samplers.laplace import (
-    MISSED_AT,
-    MISSED_BY,
-    Modes,
-    draws_beside,
-    find_modes,
-    missed_mode,
-)
+from calibrate.samplers import LaplaceOptions
 from emulator.core.errors import SolverError
 from linear_support import LinearForward, linear_forward, linear_problem
 
@@ -116,132 +101,3 @@ def test_a_second_mode_nearly_as_high_is_told(beam, slope, told):
         lower = posterior.tree.attrs["missed_mode_nats"]
         assert lower == pytest.approx((2.0 * slope / 0.1) ** 2 / 2.0, abs=0.5)
         assert posterior.tree.attrs["missed_mode"] in ("lam 75, mu 70", "lam 75, mu 80")
-
-
-KEY = jax.random.key(0)
-RNG = np.random.default_rng(0)
-
-
-def density(log_density, size, spread=3.0):
-    """A density given in unconstrained coordinates; its prior only gives the starts."""
-    return Density(
-        lambda z, data: log_density(z), size, size > 1, 1,
-        lambda z: jnp.zeros(()),
-        lambda z, data: log_density(z),
-        lambda key: spread * jax.random.normal(key, (size,)),
-        lambda z: {f"z{i}": z[:, i] for i in range(size)},
-        lambda draw: jnp.stack(list(draw.values())),
-        tuple(f"z{i}" for i in range(size)),
-    )  # fmt: skip
-
-
-def missed(log_density, draws):
-    of = density(log_density, draws.shape[1])
-    return missed_mode(of, {}, draws, find_modes(of, {}, prior_draws(of, KEY, 8), draws))
-
-
-def test_draws_beside_modes_have_their_gaussians():
-    """Correlated, against the closed form; of a slope that has no mode there are none."""
-    covariance = np.array([[0.04, 0.03], [0.03, 0.09]])
-    precision = jnp.asarray(np.linalg.inv(covariance))
-    of = density(lambda z: -0.5 * (z - 1.0) @ precision @ (z - 1.0), 2)
-    rng, modes = np.random.default_rng(0), Modes(np.ones((1, 2)), np.zeros(1))
-    draws = draws_beside(of, {}, modes, 4000, rng)
-    np.testing.assert_allclose(draws.mean(axis=0), 1.0, atol=0.02)
-    np.testing.assert_allclose(np.cov(draws, rowvar=False), covariance, atol=0.005)
-    beside = Modes(np.zeros((1, 2)), np.zeros(1))  # some sd down the slope
-    assert draws_beside(of, {}, beside, 10, rng).shape == (0, 2)
-    assert draws_beside(density(jnp.sum, 2), {}, modes, 10, rng).shape == (0, 2)
-
-
-def two(weight, apart=4.0, width=0.5):
-    """Gaussians at -apart and apart along the first of two coordinates; the second's share."""
-
-    def log_density(z):
-        centres = jnp.array([[-apart, 0.0], [apart, 0.0]])
-        heights = Normal(centres, width).log_prob(z).sum(axis=1)
-        return jax.nn.logsumexp(heights + jnp.log(jnp.array([1.0 - weight, weight])))
-
-    first, second = (
-        np.array([s * apart, 0.0]) + width * RNG.normal(size=(500, 2)) for s in (-1, 1)
-    )
-    return log_density, first, second
-
-
-@pytest.mark.parametrize("weight", [0.5, 0.2, 0.9])
-def test_a_mode_without_draws_is_reported_with_its_mass(weight):
-    log_density, first, _ = two(weight)
-    found = missed(log_density, first)
-    # The mean log density is that of 64 draws, sd 1 / 8.
-    assert found[MISSED_BY] == pytest.approx(np.log((1.0 - weight) / weight), abs=0.5)
-    place = dict(part.split(" ") for part in found[MISSED_AT].split(", "))
-    assert float(place["z0"]) == pytest.approx(4.0, abs=0.01)
-
-
-def test_nothing_is_reported_where_both_have_draws_or_the_other_is_light():
-    log_density, first, second = two(0.5)
-    assert missed(log_density, np.concatenate([first, second])) == {MISSED_BY: np.inf}
-    log_density, first, _ = two(0.01)
-    assert missed(log_density, first) == {MISSED_BY: np.inf}
-
-
-def test_a_valley_of_density_zero_is_one():
-    """As where the forward map has no answer."""
-    log_density, first, _ = two(0.5)
-    ended = lambda z: jnp.where(jnp.abs(z[0]) < 1.0, -jnp.inf, log_density(z))
-    assert missed(ended, first)[MISSED_BY] == pytest.approx(0.0, abs=0.5)
-
-
-def funnel():
-    depth = 3.0 * RNG.normal(size=2000)
-    draws = np.stack([depth, np.exp(0.5 * depth) * RNG.normal(size=2000)], axis=1)
-    return (
-        lambda z: Normal(0.0, 3.0).log_prob(z[0]) + Normal(0.0, jnp.exp(0.5 * z[0])).log_prob(z[1]),
-        draws,
-    )
-
-
-def bent_ridge():
-    x = RNG.normal(size=2000)
-    draws = np.stack([x, x**2 + 0.1 * RNG.normal(size=2000)], axis=1)
-    return lambda z: Normal(0.0, 1.0).log_prob(z[0]) + Normal(z[0] ** 2, 0.1).log_prob(z[1]), draws
-
-
-def gaussian(size):
-    sd = np.geomspace(1e-3, 1.0, size)
-    return lambda z: Normal(0.0, sd).log_prob(z).sum(), RNG.normal(size=(1000, size)) * sd
-
-
-def ended():
-    """A Gaussian that ends at one sd: no mode inside, and a wall."""
-    draws = RNG.normal(size=(4000, 2))
-    return lambda z: jnp.where(z[0] > 1.0, Normal(0.0, 1.0).log_prob(z).sum(), -jnp.inf), draws[
-        draws[:, 0] > 1.0
-    ]
-
-
-@pytest.mark.parametrize(
-    "case", [funnel(), bent_ridge(), gaussian(1), gaussian(8), gaussian(20), ended()]
-)
-def test_one_mode_of_any_shape_is_not_two(case):
-    assert missed(*case) == {MISSED_BY: np.inf}
-
-
-def test_where_the_density_is_zero_everywhere_nothing_is_found():
-    assert missed(lambda z: jnp.full((), -jnp.inf), RNG.normal(size=(50, 2))) == {MISSED_BY: np.inf}
-
-
-def test_draws_that_do_not_vary_are_left_to_other_checks():
-    log_density, _, _ = two(0.5)
-    assert missed(log_density, np.zeros((50, 2))) == {MISSED_BY: np.inf}
-
-
-@pytest.mark.parametrize(
-    ("nats", "mass"), [(0.7, "0.5 times"), (-0.7, "2 times"), (-900.0, "many")]
-)
-def test_the_sentence_names_place_and_mass(nats, mass):
-    attributes = {MISSED_BY: nats, MISSED_AT: "mu 71.3"}
-    summary = {"mu": {"r_hat": 1.0, "ess_bulk": 1e4, "ess_tail": 1e4}}
-    (sentence,) = diagnose({}, {}, summary, attributes)
-    assert "mu 71.3" in sentence
-    assert f"has {mass}" in sentence
