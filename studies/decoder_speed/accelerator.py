@@ -18,9 +18,9 @@ from studies.samplers.problems import problem
 
 import calibrate as cal
 import emulator as em
-from calibrate.samplers.density import density_of
 from calibrate.samplers.smc import SMCOptions
 from calibrate.statistical_model import Data, Model
+from calibrate.statistical_model.density import density_of
 from emulator.core.store import write_json
 from emulator.training.paper import Paper
 from emulator.training.plan import Job

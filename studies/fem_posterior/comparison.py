@@ -7,7 +7,7 @@ import numpy as np
 from studies.fem_posterior.methods import Weighed
 
 from calibrate.certificate.estimates import jackknife, moments
-from calibrate.samplers.diagnostics import effective, normalised
+from calibrate.importance.weights import effective, normalised
 
 MOMENTS = ("mean", "mean_error", "sd", "sd_error")
 

@@ -21,7 +21,7 @@ import calibrate as cal
 from calibrate.certificate import examine
 from calibrate.certificate.check import Check
 from calibrate.certificate.estimates import jackknife, moments
-from calibrate.samplers.diagnostics import normalised
+from calibrate.importance.weights import normalised
 from calibrate.samplers.nuts import NUTSOptions
 
 SHIFT = "shift, less FEM's change"

@@ -16,8 +16,8 @@ from scipy.stats import multivariate_t
 from studies.common.timing import per_call
 
 import calibrate as cal
-from calibrate.samplers.density import density_of, heights, prior_draws
 from calibrate.statistical_model import Data, Model
+from calibrate.statistical_model.density import density_of, heights, prior_draws
 
 CHAINS = 4
 FREEDOM = 5.0  # of the reference's proposal, a Student t

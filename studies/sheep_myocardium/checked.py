@@ -25,8 +25,8 @@ from studies.sheep_myocardium.solver import FINER
 from calibrate.certificate.estimates import jackknife, moments
 from calibrate.certificate.evidence import Changes, Evidence, Figure, MeshChange, Physics, Tail
 from calibrate.certificate.verdict import Certificate, judge
+from calibrate.importance.weights import pareto_shape
 from calibrate.posterior.diagnosis import Sampling
-from calibrate.samplers.diagnostics import pareto_shape
 
 _LEFT = 0.3  # of the mesh's correction
 _MOST = 3  # sets of tests of one posterior

@@ -20,7 +20,7 @@ from studies.sheep_myocardium.doubts import UNKNOWN, doubts, known_to
 from studies.sheep_myocardium.experiment import MODES
 from studies.sheep_myocardium.inference import Found, covariances, sample
 
-from calibrate.samplers.diagnostics import smoothed
+from calibrate.importance.weights import smoothed
 from emulator.core.machine import cores
 
 _HEAVIEST = 0.7  # Pareto shape of the weights' tail

@@ -2,9 +2,10 @@ r"""A check of a posterior against FEM, with as many solves as decide.
 
 1. **Train.** FEM is solved at draws of the posterior, evenly spaced, around them, at draws of the
    prior, and along descents of its own misfit (:mod:`calibrate.certificate.runs`). A correction of
-   the map is fitted to these runs (:mod:`calibrate.certificate.predictive`), and a pool of cheap
-   points follows the corrected map's posterior (:mod:`calibrate.certificate.pool`). Further runs,
-   in rounds, go where the correction is so uncertain that FEM may find the data likely after all.
+   the map is fitted to these runs (:mod:`calibrate.statistical_model.predictive`), and a pool of
+   cheap points follows the corrected map's posterior (:mod:`calibrate.statistical_model.pool`).
+   Further runs, in rounds, go where the correction is so uncertain that FEM may find the data
+   likely after all.
 2. **Test.** The other runs are at fresh points :math:`z_j` of the pool, drawn with probabilities
    :math:`a_j` that mix the corrected posterior, the draws' smoothed density, where FEM may find the
    data likely, the surroundings of the draws, and the whole pool (defensive mixture; Hesterberg
@@ -35,17 +36,17 @@ import numpy as np
 
 from calibrate.certificate.estimates import Tests, evidence_of
 from calibrate.certificate.mesh import mesh_change
-from calibrate.certificate.pool import Pool
-from calibrate.certificate.predictive import Predictive
 from calibrate.certificate.runs import Runs, Solver, correction_from, descend
 from calibrate.certificate.verdict import Certificate, judge
+from calibrate.importance.proposals import MOST_TEMPERED, Kernels, key_from, tempered
+from calibrate.importance.weights import effective, normalised
 from calibrate.posterior import Posterior
 from calibrate.posterior.diagnosis import MAP_ERRORS, MAP_MOVES
 from calibrate.posterior.posterior import make_tree
-from calibrate.samplers.diagnostics import effective, normalised
 from calibrate.samplers.modes import MISSED_AT, MISSED_BY
-from calibrate.samplers.proposals import MOST_TEMPERED, Kernels, key_from, tempered
 from calibrate.statistical_model import FEMLikelihood
+from calibrate.statistical_model.pool import Pool
+from calibrate.statistical_model.predictive import Predictive
 from emulator.core.display import Stages, counting
 from emulator.core.errors import InputError, check_arguments
 from emulator.core.machine import one_blas_thread

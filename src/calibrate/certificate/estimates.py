@@ -34,14 +34,14 @@ import numpy as np
 from scipy.special import logsumexp
 
 from calibrate.certificate.evidence import LARGEST_MASS, Changes, Evidence, Figure, Physics, Tail
-from calibrate.certificate.pool import Pool
-from calibrate.certificate.predictive import Correction, Predictive
 from calibrate.certificate.runs import Runs, least_likely
+from calibrate.importance.proposals import key_from
+from calibrate.importance.weights import effective, normalised, pareto_shape
 from calibrate.posterior import Posterior
 from calibrate.posterior.diagnosis import Misfit, Sampling, places_of
-from calibrate.samplers.diagnostics import effective, normalised, pareto_shape
-from calibrate.samplers.proposals import key_from
 from calibrate.statistical_model.errors import in_noise_sd
+from calibrate.statistical_model.pool import Pool
+from calibrate.statistical_model.predictive import Correction, Predictive
 
 GROUPS = 25
 _DRAWS = 1000  # draws of the posterior predictive check

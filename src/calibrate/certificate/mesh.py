@@ -4,7 +4,7 @@ FEM is solved at a few points of the posterior, on its mesh and on the next fine
 (:mod:`emulator.accuracy.mesh_error`). For a specimen of homogeneous states the finer one is the
 piece between its grips (:mod:`emulator.surrogates.gripped`). The difference :math:`D` in the data
 varies little over a posterior, and a Gaussian process of theta continues it
-(:mod:`calibrate.certificate.predictive`). Added to the map's error on the mesh, it gives a
+(:mod:`calibrate.statistical_model.predictive`). Added to the map's error on the mesh, it gives a
 posterior under the finer mesh's FEM, and the pool follows that posterior. The change is from the
 corrected posterior to this one, over the same points of the pool. Its error is the jackknife's over
 the solves on the finer mesh, and over the pool.
@@ -25,16 +25,16 @@ from tqdm import tqdm
 
 from calibrate.certificate.estimates import as_figures, jackknife, moments
 from calibrate.certificate.evidence import MeshChange, all_within
-from calibrate.certificate.pool import Pool
-from calibrate.certificate.predictive import (
+from calibrate.certificate.runs import Runs
+from calibrate.statistical_model.finer_fem import Finer, FinerFEM, finer_fem
+from calibrate.statistical_model.pool import Pool
+from calibrate.statistical_model.predictive import (
     Correction,
     Predictive,
     corrections,
     fit_correction,
     no_correction,
 )
-from calibrate.certificate.runs import Runs
-from calibrate.statistical_model.finer_fem import Finer, FinerFEM, finer_fem
 from emulator.accuracy.mesh_error import MeshErrorEstimate
 from emulator.core.display import counting
 from emulator.core.errors import InputError, SolverError

@@ -52,8 +52,8 @@ from calibrate.population.model import (
     to_scale,
     to_score,
 )
-from calibrate.samplers.density import Target, threads_for
 from calibrate.statistical_model import Data
+from calibrate.statistical_model.density import Target, threads_for
 from emulator.core.gaussian_process import eliminated
 
 

@@ -27,6 +27,7 @@ from scipy.linalg import eigvalsh
 from scipy.stats import ks_2samp
 
 from calibrate.arviz import base, stats
+from calibrate.importance.weights import LARGEST_PARETO_SHAPE
 from calibrate.posterior.box import BoxEnd, in_words
 from calibrate.samplers import diagnostics as limits
 from calibrate.samplers import r_hat
@@ -35,7 +36,7 @@ from calibrate.samplers.modes import MISSED_AT, MISSED_BY
 
 # Attributes of a run, as JSON: errors of the map at its draws, and sentences on noises by default.
 MAP_ERRORS, SCALED_NOISE = "map_errors", "scaled_noise"
-MAP_MOVES = "map_moves"  # a number: the most by which those errors may move a mean, in sd
+MAP_MOVES = "map_moves"  # a number: the largest move of a mean by FEM in the map's place, in sd
 
 SMALLEST_P = 0.005
 OUTLYING = 4.0  # sds, beyond which 0.6 % of sets of 100 Gaussian data have a datum
@@ -102,7 +103,8 @@ def map_fault(errors: Mapping[str, float], moves: float = np.nan) -> Fault | Non
     """Return what the forward map misses most, if by more than a share of the noise or of a mean.
 
     errors : the distance of the map's data from FEM's at the draws, in noise sd, by observation.
-    moves : the most by which that may move a posterior mean, in its sd; NaN where nobody asked.
+    moves : the largest move of a posterior mean that FEM is expected to make, in its sd; NaN where
+        nobody asked, infinite where FEM finds a part that the posterior lacks.
     """
     sizes = {name: np.inf if np.isnan(size) else size for name, size in errors.items()}
     worst = max(sizes, key=sizes.__getitem__, default="")
@@ -112,7 +114,8 @@ def map_fault(errors: Mapping[str, float], moves: float = np.nan) -> Fault | Non
         f"{value:.2g} {unit}" if np.isfinite(value) else "an unknown amount"
         for value, unit in ((sizes[worst], "noise sd"), (moves, "sd"))
     )
-    most = f", which may move a mean by {most}" if moves > LARGEST_MAP_MOVE else ""
+    told = f", and FEM in its place would move a mean by {most}"
+    most = told if moves > LARGEST_MAP_MOVE else ""
     return (
         f"the forward map misses FEM by {size} in {worst} at the draws{most}",
         "infer with --forward corrected (or more of its --steps), or let the map's error widen the "
@@ -202,17 +205,17 @@ def diagnose(
             f"quantiles are uncertain; {'take more draws' if wrong_map is None else MAP_FIRST}"
         )
     k, efficiency = attributes.get("pareto_k", 0.0), attributes.get("importance_efficiency", 1.0)
-    if not (k <= limits.LARGEST_PARETO_SHAPE and efficiency >= _LOWEST_EFFICIENCY):
+    if not (k <= LARGEST_PARETO_SHAPE and efficiency >= _LOWEST_EFFICIENCY):
         yield (
             f"the Gaussian approximation is poor, Pareto k {k:.2f} (at most "
-            f"{limits.LARGEST_PARETO_SHAPE}) and {100.0 * efficiency:.2g} % of the draws effective "
+            f"{LARGEST_PARETO_SHAPE}) and {100.0 * efficiency:.2g} % of the draws effective "
             "(at least "
             f"{100.0 * _LOWEST_EFFICIENCY:.0f} %): use a sampler, such as nuts"
         )
-    if not (k := attributes.get("weights_pareto_k", 0.0)) <= limits.LARGEST_PARETO_SHAPE:
+    if not (k := attributes.get("weights_pareto_k", 0.0)) <= LARGEST_PARETO_SHAPE:
         yield (
             f"the weights of importance sampling have a heavy tail, Pareto k {k:.2f} (at most "
-            f"{limits.LARGEST_PARETO_SHAPE}): use another sampler, such as nuts"
+            f"{LARGEST_PARETO_SHAPE}): use another sampler, such as nuts"
         )
     if (once := int(attributes.get(SEEN_ONCE, 0))) > 0:
         yield (

@@ -31,6 +31,7 @@ from emulator.core.display import Stages
 from emulator.core.errors import InputError
 from emulator.core.store import write_json
 from emulator.surrogates.fem import FEMForward
+from emulator.surrogates.homogeneous import Homogeneous
 
 NOT_CERTIFIED = "not certified"
 SECONDS = "seconds"  # attribute of a posterior: the seconds of each stage, as JSON
@@ -84,7 +85,8 @@ def infer(
                 checkpoint=None if target is None else target / SAMPLING,
             )
         errors = NOT_ASKED
-        if check_map and not isinstance(model.full, FEMForward):
+        # The states of a specimen are solved, not learned.
+        if check_map and not isinstance(model.full, FEMForward | Homogeneous):
             with stages("check of the map"):
                 errors = map_errors(
                     posterior.model, problem.simulator, posterior.draws(), posterior.data
@@ -129,7 +131,7 @@ def certify_and_keep(
     write_json(Path(folder) / CERTIFICATE, check.certificate.to_json())
     errors = check.certificate.evidence.map_errors
     seconds = json.loads(posterior.tree.attrs.get(SECONDS, "{}")) | stages.seconds
-    # The certificate tells the moves themselves, so their bound goes.
+    # The certificate tells the moves with their errors, so the estimate goes.
     attributes = {MAP_ERRORS: errors, MAP_MOVES: np.nan, SECONDS: seconds}
     posterior.tree.attrs.update(as_attributes(attributes))
     remove_pages(Path(folder).resolve())

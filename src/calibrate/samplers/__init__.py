@@ -5,13 +5,13 @@ from dataclasses import fields
 from typing import Any
 
 from calibrate.samplers.chains import ChainSampler
-from calibrate.samplers.density import Density, density_of, named_draws
 from calibrate.samplers.diagnostics import r_hat
 from calibrate.samplers.importance import AUTO, IMPORTANCE, AutoOptions, ImportanceOptions
 from calibrate.samplers.laplace import LAPLACE, LaplaceOptions
 from calibrate.samplers.nuts import BLACKJAX_NUTS, NUTS, BlackJAXNUTSOptions, NUTSOptions
 from calibrate.samplers.protocol import ChainOptions, Context, Draws, Kernel, Sampler
 from calibrate.samplers.smc import SMC, SMCOptions
+from calibrate.statistical_model.density import Density, density_of, named_draws
 from emulator.core.errors import InputError, look_up
 from emulator.core.schema import Source, parse, table_of
 

@@ -1,7 +1,7 @@
 """Markov chains of any kernel: starting points, warm-up, pilot, rounds, progress, checkpoint.
 
-A pilot run straightens the posterior (:mod:`calibrate.samplers.transport`); the draws returned are
-from a second run with fresh starting points. Both use the same compiled program. A density that
+A pilot run straightens the posterior (:mod:`calibrate.importance.transport`); the draws returned
+are from a second run with fresh starting points. Both use the same compiled program. A density that
 wants no pilot gets the second run alone.
 
 That program is one chain's, and as many chains run at once as there are cores. Vectorised, every
@@ -26,16 +26,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibrate.samplers.density import Density, Target, prior_draws
-from calibrate.samplers.modes import white_at_mode
-from calibrate.samplers.protocol import ChainOptions, Context, Draws, Kernel, Sampler, in_rounds
-from calibrate.samplers.transport import (
+from calibrate.importance.transport import (
     StandardMap,
     apply_standard,
     coefficient_count,
     fit_standard,
     standard_identity,
 )
+from calibrate.samplers.modes import white_at_mode
+from calibrate.samplers.protocol import ChainOptions, Context, Draws, Kernel, Sampler, in_rounds
+from calibrate.statistical_model.density import Density, Target, prior_draws
 from emulator.core.display import counting
 from emulator.core.errors import SolverError
 

@@ -5,7 +5,7 @@ weighted,
 
 .. math:: w_i = \frac{p(z_i)\, L(z_i)}{q(z_i)} ,
 
-kernels (:mod:`calibrate.samplers.proposals`) are put around points chosen with probability
+kernels (:mod:`calibrate.importance.proposals`) are put around points chosen with probability
 proportional to :math:`w_i^\beta`, and fresh points are drawn from this next proposal :math:`q`.
 The power :math:`\beta` is the largest at which a given number of points counts. With an eighth of
 the points the density of a step is at most some eight times that of the one before, so that several
@@ -49,15 +49,16 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.special import logsumexp
 
-from calibrate.samplers.density import Density, Heights, heights, prior_draws
-from calibrate.samplers.diagnostics import (
-    ENOUGH_ESS,
-    LARGEST_PARETO_SHAPE,
-    RUN_UNTIL_R_HAT,
-    converged,
-    normalised,
-    pareto_shape,
+from calibrate.importance.proposals import (
+    Group,
+    Kernels,
+    effective_number,
+    key_from,
+    resampled,
+    tempered,
 )
+from calibrate.importance.weights import LARGEST_PARETO_SHAPE, normalised, pareto_shape
+from calibrate.samplers.diagnostics import ENOUGH_ESS, RUN_UNTIL_R_HAT, converged
 from calibrate.samplers.modes import (
     MOST,
     Mode,
@@ -71,16 +72,9 @@ from calibrate.samplers.modes import (
     unseen,
 )
 from calibrate.samplers.nuts import NUTS, NUTSOptions
-from calibrate.samplers.proposals import (
-    Group,
-    Kernels,
-    effective_number,
-    key_from,
-    resampled,
-    tempered,
-)
 from calibrate.samplers.protocol import Context, Draws, Options, Sampler, in_rounds
 from calibrate.statistical_model import Data
+from calibrate.statistical_model.density import Density, Heights, heights, prior_draws
 from emulator.core.display import counting
 from emulator.core.errors import SolverError
 

@@ -21,8 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibrate.samplers.density import Density, prior_draws
-from calibrate.samplers.diagnostics import FEWEST_WEIGHTS, effective, normalised, pareto_shape
+from calibrate.importance.weights import FEWEST_WEIGHTS, effective, normalised, pareto_shape
 from calibrate.samplers.modes import (
     Modes,
     coloured,
@@ -33,6 +32,7 @@ from calibrate.samplers.modes import (
 )
 from calibrate.samplers.protocol import Context, Draws, Options, Sampler
 from calibrate.statistical_model import Data
+from calibrate.statistical_model.density import Density, prior_draws
 from emulator.core.errors import InputError, SolverError
 
 _STARTS = 8  # draws of the prior from which modes are searched

@@ -30,8 +30,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from calibrate.samplers.density import Density
 from calibrate.statistical_model import Data
+from calibrate.statistical_model.density import Density
 from emulator.core.minimise import minimise
 
 # Attributes of a run: the log of the draws' mass over the missed mode's, infinite if none is

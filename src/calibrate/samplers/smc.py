@@ -29,9 +29,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import logsumexp
 
-from calibrate.samplers.density import Density
 from calibrate.samplers.protocol import Context, Draws, Options, Sampler
 from calibrate.statistical_model import Data
+from calibrate.statistical_model.density import Density
 from emulator.core.display import counting
 from emulator.core.errors import SolverError
 

@@ -32,7 +32,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from scipy.stats import chi2
 
 from calibrate.model_error.kinds import Measured, read_systematic
 from calibrate.model_error.marginal import Amplitude, ModelError
@@ -41,6 +40,8 @@ from calibrate.noise.protocol import independent_information, information_about_
 from calibrate.statistical_model.fem_likelihood import FEMLikelihood
 from calibrate.statistical_model.finer_fem import finer_fem
 from calibrate.statistical_model.model import Model
+from calibrate.statistical_model.moves import Answer, largest_move
+from calibrate.statistical_model.predictive import Predictive, noise_sds
 from emulator.accuracy.estimate import newton_distance
 from emulator.accuracy.mesh_error import MeshErrorEstimate
 from emulator.core.display import counting
@@ -50,9 +51,9 @@ from emulator.fem.compiled import compiled
 
 FEWEST = 8  # FEM runs from which an error is learned
 _MODES = 12
-_STEPS = 8  # Newton steps that tell the map's error at draws, over all load states
-_FEWEST_CHANGES = 4  # draws of which an sd is taken
-_BELIEVED = 0.9  # probability with which an sd lies below its bound
+_STEPS = 12  # Newton steps of a round that tell the map's error, over all load states
+_FEWEST_ANSWERS = 4  # points of a round, and FEM runs where Newton steps are refused
+_CLOUD = 1024  # draws that points are put around
 _WIDTHS = np.geomspace(0.05, 2.0, 12)  # kernel widths in standardised unknowns
 
 
@@ -209,15 +210,13 @@ def with_error(
 
 
 class MapErrors(NamedTuple):
-    r"""What the error of a forward map does to a posterior.
+    """What the error of a forward map does to a posterior.
 
-    sizes : the error of the data in noise sd, as of :func:`in_noise_sd`, by the observation's name.
-    moves : the most by which it may move the mean of an unknown, in posterior sd; NaN where too few
-        draws were asked, infinite where FEM failed at one.
-
-    With FEM in place of the map, log likelihoods change by :math:`d(x)` and, to first order, a mean
-    by :math:`\operatorname{Cov}(x, d)`, at most :math:`\operatorname{sd}(x) \operatorname{sd}(d)`:
-    the sd of the change over the draws. From a few draws follows its upper 90 % bound.
+    sizes : the error of the data at draws in noise sd, as of :func:`in_noise_sd`, by the
+        observation's name.
+    moves : the largest move of a mean of an unknown, in posterior sd, that FEM in place of the map
+        is expected to make (:mod:`calibrate.statistical_model.moves`); NaN where too few draws
+        were answered, infinite where FEM failed at one or finds a part that the posterior lacks.
     """
 
     sizes: Mapping[str, float]
@@ -234,10 +233,11 @@ def map_errors(
     draws: Mapping[str, np.ndarray],
     data: Mapping[str, Any],
 ) -> MapErrors:
-    """Return what the map's errors do to a posterior, to first order.
+    """Return what the map's errors do to a posterior.
 
-    A Newton step at each of a few draws tells them, where its own check accepts it. Where it does
-    at fewer than four, FEM runs make it four; the errors are infinite where most of those fail.
+    A Newton step at a few draws and at points around them tells FEM's answer, where the step's own
+    check accepts it. Where it accepts fewer than four at draws, FEM runs make it four, and there
+    may be as many elsewhere; the errors are infinite where FEM fails at a draw.
 
     draws : draws (s,) by the unknown's name, or by an inferred noise sd's.
     data : the data by the observation's name.
@@ -247,8 +247,8 @@ def map_errors(
         return NOT_ASKED
     distance = compiled(partial(newton_distance, simulator.system))
     observe, predict, means = model.observe, jax.jit(model.full), jax.jit(model.means)
-    likelihood = jax.jit(model.map_log_likelihood)
-    states, count = len(model.states.states), len(next(iter(draws.values())))
+    predictive, rng = Predictive(model, dict(data), draws), np.random.default_rng(0)
+    count = max(_STEPS // len(model.states.states), _FEWEST_ANSWERS)
 
     def by_newton(u: jax.Array, theta: jax.Array) -> jax.Array:
         step = distance(u, theta)
@@ -256,62 +256,50 @@ def map_errors(
 
     def by_fem(u: jax.Array, theta: jax.Array) -> jax.Array:
         solution = simulator.solve(theta, u)
-        return solution.displacement if solution.converged else jnp.full_like(u, jnp.inf)
+        return solution.displacement if solution.converged else jnp.full_like(u, jnp.nan)
 
-    def asked(row: int, equilibrium: Callable[..., jax.Array]) -> tuple[np.ndarray, float]:
-        """Return the map's data less FEM's, and the change of the log likelihood."""
-        draw = {name: values[row] for name, values in draws.items()}
+    def answer(z: np.ndarray, equilibrium: Callable[..., jax.Array]) -> Answer | None:
+        """Return FEM's answer at z (p,); None where there is none."""
+        draw = {name: values[0] for name, values in predictive.constrain(z[None]).items()}
         thetas = model.states.thetas(draw)
         u = jnp.stack([equilibrium(predict(theta), theta) for theta in thetas])
         exact = observe(u[:, observe.nodes], thetas)
-        error = np.asarray(ravel_pytree(means(thetas)[0])[0] - ravel_pytree(exact)[0])
+        error = np.asarray(ravel_pytree(exact)[0] - ravel_pytree(means(thetas)[0])[0])
         if not np.isfinite(error).all():
-            return error, np.inf
-        return error, float(model.fem_log_likelihood(draw, exact, data) - likelihood(draw, data))
+            return None
+        height = float(model.fem_log_likelihood(draw, exact, data))
+        return Answer(z, error, height) if np.isfinite(height) else None
 
-    rows = np.linspace(0, count - 1, max(_STEPS // states, 1) + 2)[1:-1].astype(int)
-    found, refused = [], []
-    for row in np.unique(rows):
-        error, change = asked(row, by_newton)
-        if np.isfinite(change):
-            found.append((error, change))
-        else:
-            refused.append(row)
-    lacking = min(max(_FEWEST_CHANGES - len(found), 0), len(refused))
-    spread = np.linspace(0, len(refused) - 1, lacking).astype(int)
-    found += [asked(refused[k], by_fem) for k in spread]
-    errors, changes = (np.array(each) for each in zip(*found, strict=True))
-    return MapErrors(in_noise_sd(model, errors, draws), _bound_of_sd(changes))
+    def ask(points: np.ndarray, runs: int) -> tuple[list[Answer], bool]:
+        """Return the answers at points (k, p), ``runs`` at most by FEM, and whether one failed."""
+        steps = [answer(z, by_newton) for z in points]
+        refused = [z for z, step in zip(points, steps, strict=True) if step is None]
+        asked = np.linspace(0, len(refused) - 1, min(runs, len(refused))).astype(int)
+        solved = [answer(refused[k], by_fem) for k in asked]
+        found = [each for each in (*steps, *solved) if each is not None]
+        return found, any(each is None for each in solved)
 
+    z = predictive.unconstrain(draws)
+    rows = np.linspace(0, len(z) - 1, count + 2)[1:-1].astype(int)
+    known, failed = ask(z[np.unique(rows)], _FEWEST_ANSWERS)
+    if failed or len(known) < _FEWEST_ANSWERS:
+        sizes = dict.fromkeys(observe.parts, np.inf) if failed else {}
+        return MapErrors(sizes, np.inf if failed else np.nan)
+    sizes = in_noise_sd(model, np.array([each.error for each in known]), draws)
+    some = z[np.linspace(0, len(z) - 1, min(_CLOUD, len(z))).astype(int)]
+    left = [_FEWEST_ANSWERS]
 
-def _bound_of_sd(changes: np.ndarray) -> float:
-    """Return the upper bound of the sd of which ``changes`` (k,) are a few draws.
+    def ask_further(points: np.ndarray) -> list[Answer]:
+        found, _ = ask(points, left[0])
+        left[0] -= min(left[0], len(points) - len(found))
+        return found
 
-    The sum of squares about their mean, over the variance, is a chi-squared variable.
-    """
-    freedom = len(changes) - 1
-    if len(changes) < _FEWEST_CHANGES:
-        return np.nan
-    if not np.isfinite(changes).all():
-        return np.inf
-    return float(changes.std(ddof=1) * np.sqrt(freedom / chi2.ppf(1.0 - _BELIEVED, freedom)))
+    return MapErrors(sizes, largest_move(predictive, some, known, ask_further, count, rng))
 
 
 def _allows_for_map(model: Model) -> bool:
     """Return whether the likelihood of ``model`` allows for the map's error already."""
     return model.error is not None and model.error.amplitude is not None
-
-
-def noise_sds(model: Model, draws: Mapping[str, np.ndarray]) -> dict[str, float]:
-    """Return the sd of one number of each observation by noise, in its unit, by name.
-
-    draws : draws (s,) by the unknown's name; an inferred sd is the median of its draws.
-    """
-    sites = model.noise_sites
-    return {
-        name: float(noise.size({s: jnp.median(draws[site]) for s, site in sites[name].items()}))
-        for name, noise in model.noise.items()
-    }
 
 
 def in_noise_sd(

@@ -8,10 +8,10 @@ from scipy.stats import chi2, norm
 import calibrate as cal
 from calibrate.certificate import estimates
 from calibrate.certificate.estimates import jackknife, misfits, missed_by, moments
-from calibrate.certificate.pool import Pool
-from calibrate.certificate.predictive import Predictive, no_correction
 from calibrate.certificate.runs import Runs
 from calibrate.posterior.diagnosis import Misfit
+from calibrate.statistical_model.pool import Pool
+from calibrate.statistical_model.predictive import Predictive, no_correction
 from certificate_support import (
     NODES,
     exact_data,

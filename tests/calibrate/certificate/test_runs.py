@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import calibrate as cal
-from calibrate.certificate.predictive import Predictive
 from calibrate.certificate.runs import Solver, descend
 from calibrate.statistical_model import FEMLikelihood
+from calibrate.statistical_model.predictive import Predictive
 from certificate_support import grid_of, linear_model, posterior_of
 from emulator.core.display import counting
 from linear_support import LinearForward, LinearSimulator, Step, linear_forward

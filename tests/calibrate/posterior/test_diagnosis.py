@@ -82,7 +82,7 @@ def test_a_wrong_map_comes_first_and_chains_on_it_are_not_blamed_on_the_sampler(
     assert said(attributes=small | {MAP_MOVES: 0.4}) == []
     (moved,) = said(attributes=small | {MAP_MOVES: 0.6})
     assert moved.startswith(
-        "the forward map misses FEM by 0.4 noise sd in volume at the draws, which may move a mean "
+        "the forward map misses FEM by 0.4 noise sd in volume at the draws, and FEM in its place would move a mean "
         "by 0.6 sd"
     )
     assert said(attributes={SCALED_NOISE: json.dumps(["volume has"])}) == ["volume has"]

@@ -16,7 +16,7 @@ from calibrate.priors import Dependence, JointPrior
 from calibrate.priors.population import POPULATIONS, prior_of
 from calibrate.priors.priors import Conditional
 from calibrate.project import Run
-from calibrate.samplers.density import density_of
+from calibrate.statistical_model.density import density_of
 from emulator.core.errors import InputError
 from emulator.core.schema import read_json_as
 from emulator.scenes.built_in.ventricles import left_ventricle

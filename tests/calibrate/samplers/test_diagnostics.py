@@ -5,14 +5,8 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from calibrate.samplers.diagnostics import (
-    converged,
-    effective,
-    normalised,
-    pareto_shape,
-    r_hat,
-    smoothed,
-)
+from calibrate.importance.weights import effective, normalised, pareto_shape, smoothed
+from calibrate.samplers.diagnostics import converged, r_hat
 
 
 def test_smoothed_weights_move_draws_to_where_they_point():

@@ -9,9 +9,10 @@ import pytest
 from jax.scipy.stats import norm
 
 import calibrate as cal
+from calibrate.importance.proposals import Kernels, effective_number, resampled, separate
+from calibrate.importance.weights import normalised
 from calibrate.posterior.diagnosis import diagnose
 from calibrate.samplers import Density, ImportanceOptions, density_of, find_sampler
-from calibrate.samplers.diagnostics import normalised
 from calibrate.samplers.importance import (
     AUTO,
     IMPORTANCE,
@@ -19,7 +20,6 @@ from calibrate.samplers.importance import (
     SAMPLED_BY,
     AutoOptions,
 )
-from calibrate.samplers.proposals import Kernels, effective_number, resampled, separate
 from calibrate.samplers.protocol import Context
 from emulator.core.errors import InputError, SolverError
 from emulator.surrogates.fem import fem_forward

@@ -11,7 +11,6 @@ from numpyro.distributions import Normal
 
 from calibrate.posterior.diagnosis import diagnose
 from calibrate.samplers import Density
-from calibrate.samplers.density import prior_draws
 from calibrate.samplers.modes import (
     MISSED_AT,
     MISSED_BY,
@@ -25,6 +24,7 @@ from calibrate.samplers.modes import (
     shares,
     unseen,
 )
+from calibrate.statistical_model.density import prior_draws
 
 KEY = jax.random.key(0)
 RNG = np.random.default_rng(0)

@@ -6,7 +6,7 @@ import numpyro.distributions as dist
 import pytest
 
 import calibrate as cal
-from calibrate.samplers import transport
+from calibrate.importance import transport
 from emulator.core.errors import InputError
 from emulator.fem import run_campaign, sobol
 from emulator.surrogates.corrected import corrected

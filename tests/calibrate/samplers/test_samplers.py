@@ -14,7 +14,7 @@ from calibrate.samplers import (
     find_sampler,
     options_from,
 )
-from calibrate.samplers.density import density_of
+from calibrate.statistical_model.density import density_of
 from emulator.core.errors import InputError
 from emulator.surrogates.fem import fem_forward
 from linear_support import PRIOR_MEAN, PRIOR_SD, closed_form, linear_problem

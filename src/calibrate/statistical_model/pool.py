@@ -1,6 +1,6 @@
 r"""The pool of a certificate: cheap points, weighted by the map's posterior and its corrections.
 
-The points are those of :mod:`calibrate.samplers.proposals`. Proposals follow the draws of a
+The points are those of :mod:`calibrate.importance.proposals`. Proposals follow the draws of a
 posterior, surround them, and come from the prior, from which they also move to the posterior by
 themselves. So a mode is found that no draw ever visited.
 
@@ -14,9 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import logsumexp
 
-from calibrate.certificate.predictive import Correction, Evaluated, Predictive
-from calibrate.samplers.diagnostics import normalised
-from calibrate.samplers.proposals import (
+from calibrate.importance.proposals import (
     STEP,
     TEMPERED_SHARE,
     Kernels,
@@ -25,6 +23,8 @@ from calibrate.samplers.proposals import (
     key_from,
     resampled,
 )
+from calibrate.importance.weights import normalised
+from calibrate.statistical_model.predictive import Correction, Evaluated, Predictive
 
 _ENOUGH = 800.0  # effective points at which the pool is good
 _FOLLOWING = 2048  # points of the proposal that follows the draws

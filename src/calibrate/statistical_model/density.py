@@ -19,7 +19,7 @@ from numpyro import handlers
 from numpyro.distributions.transforms import biject_to
 from numpyro.infer.util import potential_energy
 
-from calibrate.statistical_model import Data, Model
+from calibrate.statistical_model.model import Data, Model
 from emulator.core.machine import cores
 from emulator.fem.campaign import at_once
 from emulator.surrogates.corrected import CorrectedForward
@@ -38,7 +38,7 @@ class Target:
 
     log_density : (z (p,), data) -> ().
     dimension : the number of coordinates, p.
-    piloted : whether a pilot run straightens the density (:mod:`calibrate.samplers.transport`).
+    piloted : whether a pilot run straightens the density (:mod:`calibrate.importance.transport`).
     at_once : the number of threads that may evaluate it at the same time.
     whitened : whether chains run in coordinates that are white at a mode, in place of a pilot.
     """
@@ -171,7 +171,7 @@ def without_nan(log_density: jax.Array) -> jax.Array:
     return jnp.where(jnp.isfinite(log_density), log_density, -jnp.inf)
 
 
-def finite_coordinates(z: jax.Array) -> np.ndarray:
+def finite_coordinates(z: jax.Array | np.ndarray) -> np.ndarray:
     """Return ``z`` with finite coordinates; a draw on a bound is at infinity."""
     return np.clip(np.nan_to_num(np.asarray(z), posinf=1e9, neginf=-1e9), -_FARTHEST, _FARTHEST)
 

@@ -4,11 +4,12 @@ import jax
 import numpy as np
 import pytest
 
-from calibrate.certificate.pool import Pool
-from calibrate.certificate.predictive import Predictive, no_correction
-from calibrate.samplers import density_of, transport
-from calibrate.samplers.diagnostics import effective, normalised
-from calibrate.samplers.proposals import Kernels, tempered
+from calibrate.importance import transport
+from calibrate.importance.proposals import Kernels, tempered
+from calibrate.importance.weights import effective, normalised
+from calibrate.samplers import density_of
+from calibrate.statistical_model.pool import Pool
+from calibrate.statistical_model.predictive import Predictive, no_correction
 from certificate_support import exact_data, exact_posterior, grid_of, linear_model, quadrature
 
 

@@ -12,7 +12,7 @@ posterior by themselves: each step puts kernels around points resampled with wei
 
 A proposal is a mixture of Student-t kernels around points. A posterior may be a thin, bent sheet.
 Its points are straightened by a transport map of unit Jacobian
-(:mod:`calibrate.samplers.transport`) so that one covariance :math:`\Sigma` describes them, and
+(:mod:`calibrate.importance.transport`) so that one covariance :math:`\Sigma` describes them, and
 
 .. math:: q_c(\zeta) = \frac1K \sum_k t_\nu(\zeta; \zeta_k, h^2 \Sigma)
 
@@ -33,8 +33,8 @@ from scipy.cluster.vq import ClusterError, kmeans2
 from scipy.optimize import brentq
 from scipy.special import gammaln, logsumexp
 
-from calibrate.samplers import transport
-from calibrate.samplers.diagnostics import effective, normalised
+from calibrate.importance import transport
+from calibrate.importance.weights import effective, normalised
 
 MOST_TEMPERED = 300.0  # effective points that the kernels of the next step are put on, at most
 TEMPERED_SHARE = 0.15  # that number at most, as a share of all points
@@ -59,13 +59,13 @@ class Group(NamedTuple):
     map_ : the transport map from straightened coordinates to z.
     centres : the centres (k, p), straightened.
     root : the factor R (p, p) of the covariance, R R^T.
-    count : the number of kernels, as many at each centre.
+    kernels : the number of kernels, as many at each centre.
     """
 
     map_: transport.TransportMap
     centres: np.ndarray
     root: np.ndarray
-    count: int
+    kernels: int
 
     @classmethod
     def of(cls, z: np.ndarray, centres: int) -> Group:
@@ -94,7 +94,7 @@ class Group(NamedTuple):
         square = (points**2).sum(axis=1)[:, None] + (centres**2).sum(axis=1)
         square = np.maximum(square - 2.0 * points @ centres.T, 0.0)
         norm = gammaln(0.5 * (nu + p)) - gammaln(0.5 * nu) - 0.5 * p * np.log(nu * np.pi)
-        norm += np.log(self.count / len(centres)) - np.linalg.slogdet(self.root)[1]
+        norm += np.log(self.kernels / len(centres)) - np.linalg.slogdet(self.root)[1]
         # Sums of powers, not of exponentials of logarithms: Student's tails do not underflow.
         tails = [(1.0 + square / (nu * h**2)) ** (-0.5 * (nu + p)) / h**p for h in widths]
         return norm + np.log(sum(t.sum(axis=1) for t in tails))
@@ -149,7 +149,7 @@ class Kernels:
     @property
     def sizes(self) -> list[int]:
         """Number of kernels of each group."""
-        return [group.count for group in self.groups]
+        return [group.kernels for group in self.groups]
 
     def sample(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """Return points z (count, p)."""

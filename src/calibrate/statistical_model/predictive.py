@@ -1,7 +1,7 @@
 r"""The posterior density at any point, by the forward map alone and with a learned correction.
 
 A certificate asks for the posterior where no draw is. In unconstrained coordinates :math:`z`
-(:mod:`calibrate.samplers.density`) the log density is
+(:mod:`calibrate.statistical_model.density`) the log density is
 
 .. math:: \log p(z) + \log p(y \mid g(\theta(z)) + d(\theta(z)))
 
@@ -42,7 +42,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from scipy.linalg import cho_factor, cho_solve
 
-from calibrate.samplers.density import (
+from calibrate.statistical_model.density import (
     BATCH,
     Density,
     density_of,
@@ -51,8 +51,7 @@ from calibrate.samplers.density import (
     prior_draws,
     without_nan,
 )
-from calibrate.statistical_model import Data, Model
-from calibrate.statistical_model.errors import noise_sds
+from calibrate.statistical_model.model import Data, Model
 from emulator.core.gaussian_process import squared_exponential
 
 _LENGTHS = (0.25, 0.5, 1.0, 2.0, 4.0)  # correlation lengths that are compared, in sd of the points
@@ -60,6 +59,18 @@ _NUGGETS = (1e-6, 1e-4, 1e-2, 1.0, 1e2)
 _TREND = 1e2
 _NEGLIGIBLE = 1e-3  # leave-one-out error, in noise sd, that changes no posterior
 _WIDTH_DRAWS = 512  # draws of the prior, from which the scale of theta's features is taken
+
+
+def noise_sds(model: Model, draws: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Return the sd of one number of each observation by noise, in its unit, by name.
+
+    draws : draws (s,) by the unknown's name; an inferred sd is the median of its draws.
+    """
+    sites = model.noise_sites
+    return {
+        name: float(noise.size({s: jnp.median(draws[site]) for s, site in sites[name].items()}))
+        for name, noise in model.noise.items()
+    }
 
 
 class Correction(NamedTuple):
@@ -285,6 +296,17 @@ class Predictive:
         prior, gradient, curvature = self._curvature(z, means, slopes)
         curvature = np.asarray(curvature) + np.diag(self.prior_sd**-2)
         return float(prior), np.asarray(gradient), curvature
+
+    def slopes(self, z: np.ndarray) -> np.ndarray:
+        """Return the derivatives (m, S, p) of the map's flat data in theta, at z (p,)."""
+        return np.asarray(self._slopes(z))
+
+    @_compiled
+    def _slopes(self, z: jax.Array) -> jax.Array:
+        def means(thetas: jax.Array) -> jax.Array:
+            return ravel_pytree(self.model.means(thetas)[0])[0]
+
+        return jax.jacfwd(means)(self.model.states.thetas(self._constrain(z)))
 
     @cached_property
     def prior_sd(self) -> np.ndarray:

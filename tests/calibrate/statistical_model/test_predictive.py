@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibrate.certificate.predictive import correct, fit_correction, no_correction
+from calibrate.statistical_model.predictive import correct, fit_correction, no_correction
 
 
 def points(count, seed=0):

@@ -1,0 +1,1 @@
+"""Weighted points: proposals they are drawn from, straightened posteriors, and their weights."""
