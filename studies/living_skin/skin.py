@@ -177,7 +177,7 @@ def measured_of(skin: Skin, data: Path, points: int) -> Measured:
         data / f"{skin.name}_points.csv", data / f"{skin.name}_displacements.csv"
     )
     amounts = read_amounts(data / f"{skin.name}_pads.csv", "moving_ux")
-    at, force = read_curve(data / f"{skin.name}_force.csv", "moving_ux_mm", "force_N")
+    at, force = read_curve(data / f"{skin.name}_force.csv", "moving_ux_mm", "force_N", [1.0])
 
     def mean_force(amount: float) -> float:
         low, high = amount - _PERIOD / 2, min(amount + _PERIOD / 2, float(at[-1]))

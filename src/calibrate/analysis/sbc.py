@@ -243,7 +243,7 @@ def _replicates(
     for r in counting(rows, "calibration", disable=not progress, unit="data set"):
         data = {name: values[r] for name, values in data_sets.data.items()}
         true = {name: values[r] for name, values in data_sets.draws.items()}
-        draws = draw(data, seed + r)
+        draws = draw(data, seed + 1 + r)  # the data sets are drawn from ``seed``
         yield Replicate(
             {**true, LOG_LIKELIHOOD: _log_likelihoods(model, true, data)},
             {**draws, LOG_LIKELIHOOD: _log_likelihoods(model, draws, data)},

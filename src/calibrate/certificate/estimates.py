@@ -139,6 +139,7 @@ def evidence_of(
         misfits(pool.predictive, pool.correction, z, key_from(rng)),
         in_noise_sd(posterior.model, errors, posterior.draws()),
         box=tuple(posterior.box_ends()),
+        noise=tuple(posterior.inferred_noise()),
     )
 
 

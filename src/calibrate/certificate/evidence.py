@@ -13,6 +13,7 @@ import numpy as np
 
 from calibrate.posterior.box import BoxEnd
 from calibrate.posterior.diagnosis import Misfit, Sampling
+from calibrate.posterior.taken_up import TakenUp
 
 # At a shift of 0.25 sd a 90 % interval still covers 88.9 %.
 LARGEST_SHIFT = 0.25
@@ -98,6 +99,10 @@ class Changes:
         ]  # fmt: skip
 
 
+SAID_HOMOGENEOUS = 'as grips = "none" says'
+NOBODY_SAID = "and nobody said how it was held"
+
+
 @dataclass(frozen=True)
 class MeshChange(Changes):
     """The changes of means and sds by a finer mesh, or by the grips of a specimen.
@@ -110,6 +115,7 @@ class MeshChange(Changes):
     widened : whether the likelihood allows for the error of the mesh.
     gripped : whether the finer mesh is of a specimen between its grips.
     why : the reason for which no finer mesh was solved; empty if one was.
+    homogeneous : of a specimen without grips, in words, who says that it deforms evenly.
     """
 
     nodes: int = 0
@@ -119,6 +125,7 @@ class MeshChange(Changes):
     widened: bool = False
     gripped: bool = False
     why: str = ""
+    homogeneous: str = ""
 
     @property
     def place(self) -> str:
@@ -191,6 +198,7 @@ class Evidence:
     map_errors : the distance of the map's data from FEM's at the draws, in noise sd.
     mesh : the changes by a finer mesh.
     box : the ends of ranges that end the posterior in place of the data.
+    noise : the noises that are inferred.
     """
 
     draws: Changes
@@ -204,3 +212,4 @@ class Evidence:
     map_errors: dict[str, float] = field(default_factory=dict)
     mesh: MeshChange = MeshChange(why="not asked")
     box: tuple[BoxEnd, ...] = ()
+    noise: tuple[TakenUp, ...] = ()

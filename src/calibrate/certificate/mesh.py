@@ -24,7 +24,12 @@ import numpy as np
 from tqdm import tqdm
 
 from calibrate.certificate.estimates import as_figures, jackknife, moments
-from calibrate.certificate.evidence import MeshChange, all_within
+from calibrate.certificate.evidence import (
+    NOBODY_SAID,
+    SAID_HOMOGENEOUS,
+    MeshChange,
+    all_within,
+)
 from calibrate.certificate.runs import Runs
 from calibrate.statistical_model.finer_fem import Finer, FinerFEM, finer_fem
 from calibrate.statistical_model.pool import Pool
@@ -40,6 +45,7 @@ from emulator.core.display import counting
 from emulator.core.errors import InputError, SolverError
 from emulator.fem import Simulator
 from emulator.fem.campaign import in_order
+from emulator.scenes.specimen import is_specimen
 
 MOST_RUNS = 30
 """Default of the largest number of solves on the finer mesh."""
@@ -91,11 +97,18 @@ def mesh_change(
         return MeshChange(why="not asked")
     if not isinstance(simulator, Simulator):
         return MeshChange(why="the simulator is not FEM's")
+    scene = simulator.scene
+    if is_specimen(scene) and scene.grips is None and scene.tube is None:
+        said = SAID_HOMOGENEOUS if scene.homogeneous else NOBODY_SAID
+        return MeshChange(why="its states are homogeneous on any mesh", homogeneous=said)
     try:
         finer = finer_fem(predictive.model, simulator)
     except InputError as reason:
         return MeshChange(why=str(reason))
     states = len(predictive.model.states.states)
+    if count is not None and count < _FEWEST * states:
+        few = f"{count} solves are fewer than {_FEWEST} points in {states} load states"
+        return MeshChange(why=f"{few}: give --mesh-runs {_FEWEST * states}")
     points = points_for(pool.z.shape[1], states, count)
     with counting(
         total=points[1] * states, desc="finer mesh", disable=not progress, unit="solve"

@@ -8,9 +8,17 @@ from typing import Any, Literal
 
 import numpy as np
 
-from calibrate.certificate.evidence import Evidence, Figure, MeshChange, Tail, all_within
+from calibrate.certificate.evidence import (
+    NOBODY_SAID,
+    Evidence,
+    Figure,
+    MeshChange,
+    Tail,
+    all_within,
+)
 from calibrate.posterior.box import in_words
 from calibrate.posterior.diagnosis import SMALLEST_P, map_fault, sampling_faults
+from calibrate.posterior.taken_up import REMEDY
 from emulator.core.display import TableRepr
 
 Verdict = Literal["accepted", "reweight", "not certified", "undecided"]
@@ -36,6 +44,10 @@ _QUADRATIC = f"make the elements quadratic (order = 2), {_WIDEN}"
 _LEARN_GRIPS = (
     "calibrate on the gripped piece (calibrate train SCENE --out grips.safetensors, then learned = "
     f'"grips.safetensors" under [grips] of the scene), {_WIDEN}'
+)
+_SAY_GRIPS = (
+    'clamps make a square 10 to 20 % stiffer; give [grips] in the scene file, or grips = "none" '
+    "where they are far from what was measured"
 )
 _REFINE = f"emulate the finer mesh (calibrate train finer:SCENE --recipe two_meshes), {_WIDEN}"
 
@@ -108,6 +120,7 @@ class Certificate(TableRepr):
                 "gripped": e.mesh.gripped,
             },
             "box": [asdict(end) for end in e.box],
+            "noise": [asdict(noise) for noise in e.noise],
             "misfit": {name: asdict(m) for name, m in e.misfit.items()},
             "map_errors": e.map_errors,
             **{name: asdict(getattr(e, name)) for name in ("sampling", "physics", "tail")},
@@ -151,14 +164,20 @@ def judge(evidence: Evidence) -> Certificate:
         agreement = [*agreement, wrong_map]
     faults += others
     if evidence.mesh.why and verdict == "accepted":
-        agreement = [(f"{agreement[0][0]} on this mesh", "")]
+        where = f"if the piece deforms evenly, {evidence.mesh.homogeneous}"
+        where = where if evidence.mesh.homogeneous else "on this mesh"
+        agreement = [(f"{agreement[0][0]} {where}", "")]
     findings = [*faults, *agreement, *mesh] if mesh_is_fine else [*faults, *mesh, *agreement]
+    findings += [(str(noise), REMEDY if noise.is_misfit else "") for noise in evidence.noise]
     sentences = tuple(": ".join(filter(None, finding)) for finding in findings)
     return Certificate(verdict, findings[0][0], sentences, evidence)
 
 
 def _mesh(mesh: MeshChange) -> tuple[bool | None, list[Finding]]:
     """Return whether the posterior stays on a finer mesh, ``None`` if undecided, and findings."""
+    if mesh.homogeneous:
+        remedy = _SAY_GRIPS if mesh.homogeneous == NOBODY_SAID else ""
+        return True, [(f"grips: the piece is taken to deform evenly, {mesh.homogeneous}", remedy)]
     if mesh.why:
         return True, [(f"no finer mesh was asked: {mesh.why}", "")]
     finer = mesh.place

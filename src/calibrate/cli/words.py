@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from argparse import ArgumentParser, Namespace
+from argparse import Action, ArgumentParser, Namespace
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
@@ -18,8 +18,40 @@ if TYPE_CHECKING:
     from emulator.scenes.scene import Scene
 
 
+class _Once(Action):
+    """The action of an option: its value, or all of them where it takes several and is repeated.
+
+    ``argparse`` keeps the last value of a repeated option, and drops the others without a word.
+    """
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option: str | None = None) -> None:
+        """Keep the value; a second one is added to the first, or refused."""
+        seen = namespace.__dict__.setdefault(_SEEN, set())
+        if self.dest in seen and option is not None:
+            if self.nargs not in ("+", "*"):
+                parser.error(f"{option} is given twice; give it once")
+            values = [*getattr(namespace, self.dest), *values]
+        seen.add(self.dest)
+        setattr(namespace, self.dest, values)
+
+
+_SEEN = "_options_seen"
+
+
 class Parser(ArgumentParser):
-    """An argument parser whose errors are one line."""
+    """An argument parser whose errors are one line, and in which a repeated option is not lost."""
+
+    def __init__(self, *arguments: Any, **about: Any) -> None:
+        super().__init__(*arguments, **about)
+        for name in (None, "store"):
+            self.register("action", name, _Once)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Return what :mod:`argparse` does."""
+        found, rest = super().parse_known_args(args, namespace)
+        if hasattr(found, _SEEN):
+            delattr(found, _SEEN)
+        return found, rest
 
     def error(self, message: str) -> NoReturn:
         """Raise the message as an :class:`InputError`."""

@@ -31,6 +31,7 @@ import numpy as np
 from calibrate.measurements import OBSERVATIONS
 from calibrate.measurements.collection import Observations, check_some, observations
 from calibrate.measurements.observation import Block, Field, Observation, Table
+from calibrate.measurements.specimens import check_tests
 from calibrate.measurements.tables import (
     KNOWN,
     DataTable,
@@ -105,6 +106,10 @@ def _observed(
         except InputError as error:
             where = f", state '{state}'" if state else ""
             raise InputError(f"data file {file.path}{where}: {error}") from error
+    try:
+        check_tests(found)
+    except InputError as error:
+        raise InputError(f"data file {file.path}: {error}") from error
     return found
 
 

@@ -25,6 +25,7 @@ from calibrate.state_names import in_state
 from emulator.core.cells import Cells, read_cells
 from emulator.core.errors import InputError
 from emulator.scenes.scene import Scene
+from emulator.scenes.states import falls
 
 _FOLLOWS = (
     0.9  # correlation of the points' mean motion with what pulls them, where frames are right
@@ -172,14 +173,56 @@ def _cells(path: Path, words: Sequence[str]) -> Cells:
 def read_amounts(path: str | Path, column: str) -> dict[str, float]:
     """Return the number in ``column`` of each frame, from a CSV file with a column ``frame``."""
     cells = _cells(Path(path), ("frame", column))
-    return {cell["frame"]: cells.number(row, column) for row, cell in cells.rows.items()}
+    amounts: dict[str, float] = {}
+    for row, cell in cells.rows.items():
+        if cell["frame"] in amounts:
+            raise InputError(
+                f"data file {path}: row {row} is of frame '{cell['frame']}', and so is one before; "
+                "give each frame one row"
+            )
+        amounts[cell["frame"]] = cells.number(row, column)
+    return amounts
 
 
-def read_curve(path: str | Path, amount: str, value: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return amounts (k,) that rise, and values (k,), from two columns of a CSV file."""
+def sign_of(scene: Scene, parameter: str, amounts: Mapping[str, float]) -> float:
+    """Return -1 where a pull is recorded as negative and the scene's parameter cannot be, else 1.
+
+    ``amounts`` keep their signs otherwise: compression is no tension.
+    """
+    ranges = {p.name: p for p in scene.parameters}
+    values = np.array(list(amounts.values()))
+    negative = bool((values <= 0.0).all() and (values < 0.0).any())
+    own = ranges.get(parameter)
+    return -1.0 if negative and own is not None and own.low >= 0.0 else 1.0
+
+
+def _side(amounts: Sequence[float] | np.ndarray) -> int:
+    """Return the side of zero on which all amounts are, 0 where they are on both."""
+    low, high = np.min(amounts), np.max(amounts)
+    return int(low >= 0.0) - int(high <= 0.0)
+
+
+def read_curve(
+    path: str | Path, amount: str, value: str, like: Sequence[float] = ()
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return amounts (k,) that rise, and values (k,), from two columns of a CSV file.
+
+    like : amounts of frames. A sensor may count the other way round than they do, so a curve that
+        lies wholly on the other side of zero changes its sign.
+
+    :class:`InputError` for a curve whose amounts go back, as those of a cycle do.
+    """
     cells = _cells(Path(path), (amount, value))
     pairs = np.array([[cells.number(row, word) for word in (amount, value)] for row in cells.rows])
-    pairs[:, 0] = np.abs(pairs[:, 0])
+    if len(like) and _side(pairs[:, 0]) * _side(like) < 0:
+        pairs[:, 0] = 0.0 - pairs[:, 0]
+    rising = pairs[:, 0] if pairs[-1, 0] >= pairs[0, 0] else -pairs[:, 0]
+    back = np.flatnonzero(falls(rising - rising.min()))
+    if len(back):
+        raise InputError(
+            f"data file {path}: column '{amount}' goes back at row {back[0] + 1}: a curve of "
+            "loading and unloading has two forces at one amount; give the rows of loading alone"
+        )
     order = np.argsort(pairs[:, 0], kind="stable")
     return pairs[order, 0], pairs[order, 1]
 

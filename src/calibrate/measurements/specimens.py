@@ -6,7 +6,7 @@ import re
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,7 @@ from emulator.scenes.states import APPLIED, AXES, States
 
 _APART = 1e3  # distance between the sites of two tests, whose errors do not correlate
 _ROUND_OFF = 1e-6
+_FEWEST_ALIKE, _DIGITS_ALIKE = 3, 9  # rows, and decimals, in which two tests are the same one
 
 
 class SpecimenCurves(PointObservation):
@@ -190,5 +191,23 @@ class Components(SpecimenCurves):
         return cls(scene, tuple(str(text) for text in texts))  # type: ignore[call-arg]
 
 
-IN_MN = {"mN": 1.0, "N": 1e3, "g": 9.80665, "gf": 9.80665, "kN": 1e6}
-"""Units of columns of forces in mN."""
+def check_tests(observed: Mapping[str, tuple[Any, np.ndarray]]) -> None:
+    """Raise InputError if two tests of a specimen have the same motions and the same numbers.
+
+    observed : each observation of a load state and its data, by name.
+    """
+    curves = [(part, y) for part, y in observed.values() if isinstance(part, SpecimenCurves)]
+    seen: dict[bytes, str] = {}
+    for test, rows in curves[0][0].tests.items() if curves else ():
+        if len(rows) < _FEWEST_ALIKE:
+            continue
+        states = curves[0][0].states
+        numbers = [y[rows].reshape(len(rows), -1) for _, y in curves]
+        motion = [a[rows].reshape(len(rows), -1) for a in (states.gradients, states.pulls)]
+        content = np.round(np.hstack([*motion, *numbers]), _DIGITS_ALIKE) + 0.0
+        first = seen.setdefault(content.tobytes(), test)
+        if first != test:
+            raise InputError(
+                f"tests '{first}' and '{test}' have the same {len(rows)} rows, which would count "
+                "twice: leave one out"
+            )

@@ -33,15 +33,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibrate.measurements.observation import Block, Field, Table
-from calibrate.measurements.specimens import IN_MN, Components
+from calibrate.measurements.specimens import Components
 from emulator.core.errors import InputError
+from emulator.core.units import IN_KPA, IN_MM2, IN_MN, factor, other_units
 from emulator.mechanics.kinematics import cofactor, determinant
 from emulator.scenes.scene import Scene
 from emulator.scenes.states import (
     AXES,
-    IN_KPA,
     components_of,
-    factor,
     motion_columns,
     pull_columns,
     with_unit,
@@ -52,7 +51,6 @@ from emulator.surrogates.homogeneous import homogeneous_stresses
 _COMPONENT = re.compile(r"(stress|cauchy|second)_([xyz])([xyz])?")
 _PULL = re.compile(r"force(_[xyz][xyz]?)")
 _AREA = re.compile(r"area(_[xyz][xyz]?)")
-_IN_MM2 = {"mm2": 1.0, "cm2": 100.0, "m2": 1e6}
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +76,7 @@ class Stress(Components):
     pattern = _COMPONENT
     such_as = "give stress, cauchy or second with its plane, such as stress_x or stress_xy"
     unit = "kPa"
-    other_units = {"MPa": 1e3, "Pa": 1e-3, "mmHg": 0.13332239}
+    other_units = other_units(IN_KPA, "MPa", "Pa", "mmHg")
     value_fields = (Field("stress_x", ("stress_x",)),)
 
     def __post_init__(self) -> None:
@@ -188,22 +186,33 @@ def _parts(component: str) -> tuple[str, int, int]:
 
 def _in_kpa(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the stresses in kPa by component; forces are divided by their areas."""
-    areas, columns = dict[str, np.ndarray](), dict[str, np.ndarray]()
+    areas, columns = dict[str, np.ndarray](), dict[str, tuple[str, np.ndarray]]()
     for word, values in arrays.items():
         name, unit = with_unit(word)
         if (found := _AREA.fullmatch(name)) is not None:
-            areas[found[1]] = values * factor(word, unit, "mm2", _IN_MM2)
+            areas[found[1]] = values * factor(word, unit, "mm2", IN_MM2)
     for word, values in arrays.items():
         name, unit = with_unit(word)
         if _COMPONENT.fullmatch(name) is not None:
-            columns[name] = values * factor(word, unit, "kPa", IN_KPA)
+            component, stress = name, values * factor(word, unit, "kPa", IN_KPA)
         elif (found := _PULL.fullmatch(name)) is not None:
             if (area := areas.get(found[1])) is None:
                 raise InputError(
                     f"column '{word}' is a force; give the area at rest as well, 'area{found[1]}'"
                 )
-            columns[f"stress{found[1]}"] = values * factor(word, unit, "mN", IN_MN) / area
-    return columns
+            component = f"stress{found[1]}"
+            stress = values * factor(word, unit, "mN", IN_MN) / area
+        else:
+            continue
+        for other, (source, known) in columns.items():
+            both = ~np.isnan(known + stress)
+            if _parts(other)[1:] == _parts(component)[1:] and both.any():
+                raise InputError(
+                    f"columns '{source}' and '{word}' both have a stress of row "
+                    f"{both.argmax() + 1}, which would count twice: leave one out"
+                )
+        columns[component] = word, stress
+    return {component: stress for component, (_, stress) in columns.items()}
 
 
 stresses = Stress.of

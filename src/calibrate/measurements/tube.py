@@ -16,11 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibrate.measurements.observation import Block, Field, Table
-from calibrate.measurements.specimens import IN_MN, SpecimenCurves
+from calibrate.measurements.specimens import SpecimenCurves
 from emulator.core.errors import InputError
+from emulator.core.units import IN_KPA, IN_MN, factor, other_units
 from emulator.mechanics.kinematics import determinant
 from emulator.scenes.scene import Scene
-from emulator.scenes.states import IN_KPA, factor, with_unit
+from emulator.scenes.states import with_unit
 from emulator.scenes.tube import Tube, motion_columns
 from emulator.surrogates.homogeneous import homogeneous_stresses
 
@@ -89,7 +90,7 @@ class TubePressure(OfTube):
     column = "pressure"
     unit = "kPa"
     units = IN_KPA
-    other_units = {"mmHg": 0.13332239, "Pa": 1e-3, "MPa": 1e3}
+    other_units = other_units(IN_KPA, "mmHg", "Pa", "MPa")
     integral = Tube.pressure
 
 
@@ -101,5 +102,5 @@ class TubeForce(OfTube):
     column = "force_axial"
     unit = "mN"
     units = IN_MN
-    other_units = {"N": 1e3, "gf": 9.80665}
+    other_units = other_units(IN_MN, "N", "gf")
     integral = Tube.axial_force

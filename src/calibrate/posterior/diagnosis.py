@@ -123,16 +123,36 @@ def map_fault(errors: Mapping[str, float], moves: float = np.nan) -> Fault | Non
     )
 
 
-def summary_of(
-    draws: Mapping[str, np.ndarray], probability: float = 0.9
-) -> dict[str, dict[str, float]]:
+class Summary(dict[str, dict[str, float]]):
+    """The numbers of each parameter by their names, printed as a table."""
+
+    def __repr__(self) -> str:
+        """Return a line for each parameter, numbers to four digits."""
+        columns = list(next(iter(self.values()), {}))
+        rows = [["", *columns]]
+        rows += [[name, *(f"{row[each]:.4g}" for each in columns)] for name, row in self.items()]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        return "\n".join(
+            "  ".join(
+                [
+                    row[0].ljust(widths[0]),
+                    *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True)),
+                ]
+            )
+            for row in rows
+        )
+
+    __str__ = __repr__
+
+
+def summary_of(draws: Mapping[str, np.ndarray], probability: float = 0.9) -> Summary:
     """Return mean, sd, equal-tailed interval, R-hat, bulk and tail ESS of draws (chains, draws)."""
     dataset = base.dict_to_dataset(dict(draws))
     # By default ArviZ takes the tails of its own interval, which a user may have set.
     bulk = stats.ess(dataset, method="bulk")
     tail = stats.ess(dataset, method="tail", prob=(0.05, 0.95))
     edge = 0.5 * (1.0 - probability)
-    table = {}
+    table = Summary()
     for name, values in draws.items():
         low, high = np.quantile(values, [edge, 1.0 - edge])
         table[name] = {

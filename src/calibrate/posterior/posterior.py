@@ -19,7 +19,8 @@ from calibrate.arviz import base
 from calibrate.measurements import Observation, Observations, missing_values
 from calibrate.posterior import predictions
 from calibrate.posterior.box import BoxEnd, box_ends
-from calibrate.posterior.diagnosis import diagnose, misfits, nothing_learned, summary_of
+from calibrate.posterior.diagnosis import Summary, diagnose, misfits, nothing_learned, summary_of
+from calibrate.posterior.taken_up import TakenUp, sentences, taken_up
 from calibrate.provenance import as_attributes, versions
 from calibrate.samplers import check_options, density_of, find_sampler, named_draws
 from calibrate.samplers.checkpoint import Checkpoint, identity_of
@@ -107,7 +108,7 @@ class Posterior(TableRepr):
         outputs = predictions.outputs_of(*key)
         return outputs.values(thetas).reshape(-1, *observe.shape)
 
-    def summary(self, probability: float = 0.9) -> dict[str, dict[str, float]]:
+    def summary(self, probability: float = 0.9) -> Summary:
         """Return mean, sd, equal-tailed interval, R-hat, bulk and tail ESS, by parameter."""
         draws = self.tree["posterior"]
         return summary_of({n: np.asarray(draws[n]) for n in self.model.names}, probability)
@@ -136,7 +137,11 @@ class Posterior(TableRepr):
             }
             noise = ", ".join(f"{sd} of {name}" for name, sd in sds.items())
             faults += nothing_learned(self.tree, model.states.unknowns, noise)
-        return [*faults, *misfits(self.tree)]
+        return [*faults, *misfits(self.tree), *sentences(self.inferred_noise())]
+
+    def inferred_noise(self) -> list[TakenUp]:
+        """Return the inferred noise of each observation, beside its signal and its scatter."""
+        return list(taken_up(self.model, self.data, self.draws()))
 
     def box_ends(self) -> list[BoxEnd]:
         """Return the ends of ranges that end the posterior in place of the data, worst first."""

@@ -35,6 +35,7 @@ from emulator.scenes.scene import Scene
 
 Prior = Mapping[str, dist.Distribution]
 
+_SYMMETRIC = (dist.Normal, dist.StudentT, dist.Laplace, dist.Logistic, dist.Cauchy)
 _BISECTIONS = 80  # halves an interval until double precision ends
 _EDGE = 1e-15  # mass beyond which scores end, at 7.9 sd: the ends of a range have infinite ones
 
@@ -134,7 +135,20 @@ class Truncated(dist.Distribution):
     @property
     def _ends(self) -> tuple[jax.Array, jax.Array]:
         """Cumulative distribution function of the base at both ends."""
-        return self.base_dist.cdf(self.low), self.base_dist.cdf(self.high)
+        return self._base_cdf(self.low), self._base_cdf(self.high)
+
+    def _base_cdf(self, value: ArrayLike) -> jax.Array:
+        """Return the base's cumulative distribution function, up to a constant.
+
+        In an upper tail differences of numbers close to 1 would be round-off, so there it is
+        F(x) - 1, by symmetry -F(2 m - x) about the middle m.
+        """
+        base, x, low = self.base_dist, jnp.asarray(value), self.low
+        if isinstance(base, dist.LogNormal):
+            base, x, low = dist.Normal(base.loc, base.scale), jnp.log(x), jnp.log(low)
+        if not isinstance(base, _SYMMETRIC):
+            return base.cdf(x)
+        return jnp.where(low > base.loc, -base.cdf(2.0 * base.loc - x), base.cdf(x))
 
     def log_prob(self, value: ArrayLike) -> jax.Array:
         """Return the log density: the base's less the log of its mass inside; -inf outside."""
@@ -147,7 +161,7 @@ class Truncated(dist.Distribution):
         """Return the cumulative distribution function."""
         below, above = self._ends
         within = jnp.clip(value, self.low, self.high)
-        return (self.base_dist.cdf(within) - below) / (above - below)
+        return (self._base_cdf(within) - below) / (above - below)
 
     def icdf(self, q: ArrayLike) -> jax.Array:
         """Return quantiles, by bisection: many bases have no inverse of their own."""

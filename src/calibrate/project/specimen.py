@@ -27,8 +27,11 @@ _MODULI = (0.005, 3.0)  # range of a modulus, as a share of the largest stress o
 _EXPONENTS = (0.1, 50.0)
 _KAPPA = 1e4  # bulk modulus, likewise: 1000 changes stresses of stretched fibres by 0.4 %
 _NOISE = 0.03  # scale of both sds of the noise, as a share of the largest stress
+_NO_GRIPS = (
+    'grips = "none"   # CHANGE: the verdict takes stresses to be even; or [grips], at the end'
+)
 _GRIPS = (
-    "# [grips]   # how the piece was held, so that the certificate says what that does",
+    "# [grips]   # how the piece was held, for the line above: the certificate says what it does",
     "# size = [10.0, 10.0, 1.0]   # mm between the grips along x, y and z",
     '# held = "clamped"   # or "hooks"',
     "# marks = 2.0   # mm, side of the square in which stretches were measured; not of the grips",
@@ -94,6 +97,7 @@ def draft_specimen(
             for name, (part, most) in largest.items()
         ),
         f"ranges of moduli follow from a stiffness of {slope:.3g} kPa",
+        *([] if tube else ['stresses are even, grips = "none", or how it was held, [grips]']),
         "incompressible, --forward homogeneous takes the law's kappa; FEM, which checks, takes it, "
         "too",
         *(
@@ -186,6 +190,8 @@ def _stiffnesses(tube: Tube | None) -> list[str]:
 def _scene_text(law: Law, table: str, axes: list[str], slope: float, tube: Tube | None) -> str:
     """Return the scene file. Fibres are along the first axis that is pulled, sheets across it."""
     lines = [f'law = "{law.name}"   # see docs/laws.md for others', f'specimen = "{table}"']
+    if tube is None:
+        lines.append(_NO_GRIPS)
     if law.fibres:
         first = axes[0] if axes else "x"
         second = next(a for a in [*axes[1:], *AXES] if a != first)

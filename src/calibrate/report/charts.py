@@ -25,6 +25,7 @@ _CHAINS = COLOURS[:6]
 _MOST_TRACED = 500  # largest number of a chain's draws in a trace
 _MOST_PAIRED = 800  # largest number of draws in a pair plot
 _CURVES = 60  # largest number of draws in a pressure-volume band
+_KNOWN = 1e-9  # range of a known pressure over draws, relative: round-off
 _VOLUMES = 400  # largest number of draws of a volume
 _CLOSER_AT_REST = 3  # power of Klotz's pressures, as his curve rises from 0
 
@@ -235,11 +236,12 @@ def volume_band(posterior: Posterior) -> go.Figure | None:
         name="without load, as the mesh is",
     )  # fmt: skip
     for label, (volume, pressures) in data_volumes.items():  # at the pressure of its load state
+        is_known = np.ptp(pressures) <= _KNOWN * abs(pressures[0])
         figure.add_scatter(
             x=[volume], y=[float(pressures.mean())], mode="markers",
             marker={"color": VERMILION, "size": 11, "symbol": "x"},
             error_y={"type": "data", "array": [float(pressures.std())]},
-            name=f"{label} measured; pressure {'known' if pressures.std() == 0.0 else 'inferred'}",
+            name=f"{label} measured; pressure {'known' if is_known else 'inferred'}",
         )  # fmt: skip
     figure.update_layout(
         xaxis_title="cavity volume (mL)",

@@ -8,8 +8,8 @@ The pool, weighted by the likelihood with the last correction and by the map's, 
 posteriors' means.
 
 A correction is smooth, and where the map fails abruptly it is wrong, too. So points count at which
-FEM finds the data likely and the correction, before it was told, did not: the posterior then lacks
-a part of unknown mass.
+FEM finds the data likely, and neither the map did nor the correction before it was told: the
+posterior then lacks a part of unknown mass.
 """
 
 from __future__ import annotations
@@ -72,7 +72,8 @@ def largest_move(
             points = pool.z[rng.choice(len(pool.z), size=count, p=chances)]
         if fresh := ask(points):
             asked = np.array([answer.z for answer in fresh])
-            predicted = predictive.evaluate(asked, correction).corrected
+            at = predictive.evaluate(asked, correction)
+            predicted = np.maximum(at.corrected, at.cheap)
             surprises += [a.log_likelihood - p for a, p in zip(fresh, predicted, strict=True)]
         answers += fresh
         correction = _fitted(predictive, answers, rows)

@@ -23,6 +23,7 @@ PROTOCOL, BRANCH = "protocol", "branch"
 """Columns of the test that a row belongs to, and of whether it was loading."""
 UNLOADING = "unloading"
 """The word in the column ``branch`` of rows that are left out."""
+_MARKED = re.compile(r"[-+]?\d+([.,])\d+")
 MISSING = ("", "na", "n/a", "nan")
 
 
@@ -49,6 +50,8 @@ class Cells(NamedTuple):
         if gaps and cell.lower() in MISSING:
             return float("nan")
         try:
+            if "_" in cell:  # Python reads 5_7 as 57
+                raise ValueError
             return float(cell.replace(",", ".") if self.decimal_comma and "." not in cell else cell)
         except ValueError as error:
             fault = f"'{cell}', not a number" if cell else "empty"
@@ -73,6 +76,10 @@ def read_cells(path: Path, *, unloading: bool = False) -> Cells:
             f"data file {path}: its first line, '{first}', has no names "
             "of columns; put them above it, e.g. node,ux,uy,uz"
         )
+    while words and not words[-1] and not any("".join(row[len(words) - 1 :]) for row in cells):
+        words = words[:-1]  # as spreadsheets export them
+    while cells and not any(cells[-1]):
+        cells = cells[:-1]
     for word in words:
         if word and words.count(word) > 1:
             raise InputError(f"data file {path}: column '{word}' is there twice")
@@ -91,7 +98,30 @@ def read_cells(path: Path, *, unloading: bool = False) -> Cells:
         raise InputError(f"data file {path}: names of columns, and no row below them")
     if BRANCH in words and not unloading:
         rows = {k: row for k, row in rows.items() if row[BRANCH].lower() != UNLOADING}
+        if not rows:
+            raise InputError(
+                f"data file {path}: each row is unloading, so that none is left; read a test that "
+                f"was recorded while it unloads from its end: reverse its rows, without '{BRANCH}'"
+            )
+    _check_marks(path, rows, decimal_comma=decimal_comma)
     return Cells(path, words, rows, decimal_comma)
+
+
+def _check_marks(path: Path, rows: Mapping[int, Mapping[str, str]], *, decimal_comma: bool) -> None:
+    """Refuse numbers with a comma beside others with a point: one may be of thousands."""
+    if not decimal_comma:
+        return
+    first: dict[str, tuple[int, str, str]] = {}
+    for number, row in rows.items():
+        for word, cell in row.items():
+            if (found := _MARKED.fullmatch(cell)) is not None:
+                first.setdefault(found[1], (number, word, cell))
+    if len(first) == 2:
+        (a, in_a, one), (b, in_b, other) = first.values()
+        raise InputError(
+            f"data file {path}: row {a}, column '{in_a}' is '{one}' and row {b}, column '{in_b}' "
+            f"is '{other}': write all decimals with a comma, or all with a point"
+        )
 
 
 Raw = tuple[list[str], list[list[str]], bool]

@@ -94,6 +94,7 @@ def read_scene(path: str | Path) -> Scene:
             dilatation=file.dilatation,
             loaded_by=file.loaded_by,
             grips=grips,
+            homogeneous=file.grips == "none",
             tube=tube,
         )
     except InputError as error:
@@ -117,7 +118,7 @@ def _tube(file: SceneFile) -> Tube | None:
     """Return the sector of a tube."""
     if file.tube is None:
         return None
-    if file.specimen is None or file.grips is not None:
+    if file.specimen is None or file.grips not in (None, "none"):
         raise InputError("a tube is a specimen without grips; give its table as 'specimen'")
     return Tube(**file.tube.model_dump())
 
@@ -128,6 +129,8 @@ def _grips(folder: Path, file: SceneFile) -> Grips | None:
         return None
     if file.specimen is None:
         raise InputError("only a specimen has grips; hold a mesh by [[supports]]")
+    if file.grips == "none":
+        return None
     entries = file.grips.model_dump()
     learned = entries.pop("learned")
     return Grips(**entries, learned=Learned.read(folder / learned) if learned else None)

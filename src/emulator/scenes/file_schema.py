@@ -97,7 +97,7 @@ class SceneFile(Table):
     specimen: str | None = None
     """in place of mesh, a table (CSV or spreadsheet) of the states of a tested specimen, relative
     to this file: docs/specimens.md."""
-    grips: GripsTable | None = None
+    grips: GripsTable | Literal["none"] | None = None
     """how the specimen was held; without it, states are homogeneous and nothing else is asked."""
     tube: TubeTable | None = None
     """of a specimen that is a tube, whose table has radii and stretch_axial."""

@@ -42,6 +42,7 @@ _LEFT_OUT = frozenset(
         "name",  # only in messages
         "origin",  # how the scene was made, which a file need not know
         "fibre_rule",  # its directions on this mesh are in "fibres"
+        "homogeneous",  # what a user says of a specimen's states, which are that anyway
     }
 )
 

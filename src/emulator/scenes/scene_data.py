@@ -74,6 +74,8 @@ class SceneData:
         ``{"pressure": "imaged"}``. A simulator then unloads and loads
         (:mod:`emulator.fem.loaded`), and displacements are those from the mesh.
     grips : how a specimen was held (:mod:`emulator.scenes.gripped`).
+    homogeneous : whether somebody said that a specimen without ``grips`` deforms evenly. It
+        changes no solution: verdicts name the assumption, and by whom it is made.
     tube : the sector that a specimen's states are points of (:mod:`emulator.scenes.tube`).
     """
 
@@ -95,6 +97,7 @@ class SceneData:
     grips: Grips | None = None
     tube: Tube | None = None
     stiffness_modes: np.ndarray | None = None
+    homogeneous: bool = False
 
     def __post_init__(self) -> None:
         for name in ("constants", "origin", "loaded_by"):
@@ -117,6 +120,8 @@ class SceneData:
             for load in self.loads:
                 load.check(self.mesh, prescribed)
             self._check_image()
+            if self.grips is not None and self.homogeneous:
+                raise InputError("it has grips, and is said to deform evenly; say one of the two")
             if self.grips is not None and self.loads:
                 raise InputError(
                     "grips move a specimen; with applied stresses they are not supported: leave "

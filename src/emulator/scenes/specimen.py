@@ -10,7 +10,8 @@ what is prescribed. A pull P along axis i is a dead force on corner :math:`e_i`,
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +22,14 @@ from emulator.core.errors import InputError
 from emulator.geometry.mesh import Mesh
 from emulator.scenes.loads.force import MN_PER_N, Force
 from emulator.scenes.scene import Scene
-from emulator.scenes.states import AXES, States, motion_columns, pull_columns, states
+from emulator.scenes.states import AXES, States, motion_columns, pull_columns, states, with_unit
 from emulator.scenes.supports.dirichlet import Support
 from emulator.scenes.tube import Tube
 from emulator.scenes.tube import motion_columns as tube_columns
 
 _APART = 2.0  # mm between the tetrahedra of two states
 _VOLUME = 1.0 / 6.0  # mm3, of a tetrahedron
+_CONVENTION = re.compile(r"(lambda|λ|sigma|σ)_?([xyzXYZ]{1,2})")
 _CORNER = "corner."  # before the names of the sets that are held or pulled; other sets are tests
 
 
@@ -117,6 +119,11 @@ def read_states(path: Path, tube: Tube | None = None) -> States:
             f"data file {path} is of a tube ({', '.join(of_tube)}); give the sector that it opens "
             "to: calibrate init --tube, or [tube] in the scene file"
         )
+    if not words:
+        raise InputError(
+            f"data file {path}: no column says how the specimen moves: stretch_x, strain_x or "
+            f"shear_xy{_likely(cells.words)}; it has {', '.join(filter(None, cells.words))}"
+        )
     columns = {w: np.array([cells.number(k, w, gaps=True) for k in rows]) for w in words}
     names = [cells.rows[k][PROTOCOL] for k in rows] if PROTOCOL in cells.words else None
     try:
@@ -126,6 +133,18 @@ def read_states(path: Path, tube: Tube | None = None) -> States:
         return states_in(columns, names, tube=tube)
     except InputError as error:
         raise InputError(f"data file {path}: {error}") from error
+
+
+def _likely(words: Sequence[str]) -> str:
+    """Return which names the columns of other conventions may have to get, in words."""
+    renamed = []
+    for word in words:
+        name, unit = with_unit(word)
+        found = _CONVENTION.fullmatch(name)
+        if found is not None:
+            own = "stretch" if found[1] in ("lambda", "λ") else "cauchy"
+            renamed.append(f"{word} {own}_{found[2][0].lower()}{f' [{unit}]' if unit else ''}")
+    return f"; call {', '.join(renamed)} if they are that" if renamed else ""
 
 
 def is_specimen(scene: Scene) -> bool:

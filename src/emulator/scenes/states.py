@@ -31,19 +31,20 @@ import numpy as np
 
 from emulator.core.cells import PROTOCOL
 from emulator.core.errors import InputError
+from emulator.core.units import IN_KPA, factor
 
 AXES = "xyz"
 APPLIED = "applied"
 _MOTION = re.compile(rf"(stretch|strain|green|{APPLIED})_([xyz])|shear_([xyz])([xyz])")
 _WITH_UNIT = re.compile(r"([^\[(]*[^\[( ]) *(?:[\[(] *([^\])]*?) *[\])])?")
-STRETCHES = (0.2, 5.0)
-"""Smallest and largest stretch that a table may have."""
-_MOST_SHEAR = 3.0
-_ROUND_OFF = 1e-9
-_BACK = 0.02  # share of a test's largest pull by which a pull may go back, as measured ones do
-
-IN_KPA = {"kPa": 1.0, "Pa": 1e-3, "MPa": 1e3, "mmHg": 0.13332239, "g/cm2": 0.0980665}
-"""Units of columns of stresses in kPa."""
+STRETCHES = (0.1, 12.0)
+"""Smallest and largest stretch that a table may have; elastomers reach 10."""
+_MOST_SHEAR = 5.0
+_UNDOUBTED = 1.0  # strain or shear above which a column has to say that it is not in percent
+_BACK = 0.02  # share of a test's largest motion or pull by which measured ones may go back
+_NOISE, _MOST_BACK = 5.0, 0.1  # sds of noise by which they may go back, and share at most
+_FEWEST_NOISY = 8  # rows of a test that show its noise
+_SD_OF_SECOND_DIFFERENCE = 0.6745 * np.sqrt(6.0)  # median of its size, over the noise's sd
 
 
 class States(NamedTuple):
@@ -81,14 +82,6 @@ def with_unit(word: str) -> tuple[str, str]:
     """Return the name and the unit of a column such as ``stress_x [kPa]``; no unit is empty."""
     found = _WITH_UNIT.fullmatch(word.strip())
     return (found[1], found[2] or "") if found else (word, "")
-
-
-def factor(word: str, unit: str, usual: str, known: Mapping[str, float]) -> float:
-    """Return the factor from a column's unit, ``usual`` where it has none."""
-    plain = unit.replace("²", "2").replace("^", "") or usual
-    if plain not in known:
-        raise InputError(f"column '{word}': unit '{unit}' is unknown; one of {', '.join(known)}")
-    return known[plain]
 
 
 def motion_columns(words: Collection[str]) -> list[str]:
@@ -133,8 +126,10 @@ def states(
     H, pulls = components_of(columns)
     count, diagonal, pulled = len(H), np.eye(3, dtype=bool), ~np.isnan(pulls)
     free = np.isnan(H[:, range(3), range(3)]) | pulled
+    sheared = [w for w in columns if with_unit(w)[0].startswith("shear_")]
+    held = np.array([~np.isnan(columns[w]) for w in sheared]).any(axis=0) | np.zeros(count, bool)
     gradients = np.where(free[:, :, None] & diagonal, 0.0, H)
-    _check(gradients, free, pulled)
+    _check(gradients, free, pulled, held)
     tests = rows_of([""] * count if protocols is None else protocols)
     for name, own in tests.items() if ordered else ():
         _check_path(gradients[own], free[own], pulls[own], own, name)
@@ -172,6 +167,7 @@ def components_of(columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.nda
         if measure == APPLIED:
             pulls[:, place[0]] = numbers * factor(word, unit, "kPa", IN_KPA)
             continue
+        _check_unit(word, measure, unit, numbers)
         component = H[:, place[0], place[1]] = _component(word, measure, unit, numbers)
         kind, rest = ("shear", 0.0) if axis is None else ("stretch", 1.0)
         _check_component(word, rest + component, kind)
@@ -183,6 +179,16 @@ def components_of(columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.nda
 def rows_of(names: Sequence[str]) -> dict[str, np.ndarray]:
     """Return the rows (k,) of each test, from the test of each row."""
     return {n: np.flatnonzero([n == name for name in names]) for n in dict.fromkeys(names)}
+
+
+def _check_unit(word: str, measure: str | None, unit: str, values: np.ndarray) -> None:
+    """Refuse strains and shears (m,) without a unit that may be in percent."""
+    largest = float(np.nanmax(np.abs(values), initial=0.0))
+    if unit == "" and measure != "stretch" and largest > _UNDOUBTED:
+        raise InputError(
+            f"column '{word}' reaches {largest:g} and has no unit: is it in percent? call it "
+            f"'{word.strip()} [%]' if it is in percent, '{word.strip()} [-]' if it is not"
+        )
 
 
 def _component(word: str, measure: str | None, unit: str, values: np.ndarray) -> np.ndarray:
@@ -213,10 +219,9 @@ def _check_component(word: str, values: np.ndarray, kind: str) -> None:
         )
 
 
-def _check(H: np.ndarray, free: np.ndarray, pulled: np.ndarray) -> None:
-    """Refuse states that no specimen has."""
-    sheared = (np.abs(H) * (1.0 - np.eye(3))).any(axis=(1, 2))
-    loose = np.flatnonzero(free.all(axis=1) & ~sheared & ~pulled.any(axis=1))
+def _check(H: np.ndarray, free: np.ndarray, pulled: np.ndarray, held: np.ndarray) -> None:
+    """Refuse states that no specimen has; ``held`` (m,) says where a shear is given, if of 0."""
+    loose = np.flatnonzero(free.all(axis=1) & ~held & ~pulled.any(axis=1))
     if len(loose):
         raise InputError(f"row {loose[0] + 1} has no stretch and no shear; give one, or drop it")
     J = np.linalg.det(np.eye(3) + H)
@@ -242,11 +247,37 @@ def _check_path(
                 )
     away = np.linalg.norm(H, axis=(1, 2))
     pull = np.linalg.norm(np.nan_to_num(pulls), axis=1)
-    fell = (np.diff(away) < -_ROUND_OFF) | (np.diff(pull) < -_BACK * pull.max())
-    back = np.flatnonzero(fell)
-    if len(back):
+    back = np.flatnonzero(falls(away) | falls(pull))
+    if not len(back):
+        return
+    if _through_rest(H):
         raise InputError(
-            f"row {rows[back[0] + 1] + 1}{test} is nearer to rest than the one before: unloading "
-            "goes under 'unloading' in a column 'branch', another test under another name in a "
-            f"column '{PROTOCOL}'"
+            f"the rows{test} go through rest, from one side to the other: name the rows of either "
+            f"side as a test of its own in a column '{PROTOCOL}', each from rest"
         )
+    raise InputError(
+        f"row {rows[back[0]] + 1}{test} is nearer to rest than one before: unloading "
+        "goes under 'unloading' in a column 'branch', another test under another name in a "
+        f"column '{PROTOCOL}'"
+    )
+
+
+def falls(way: np.ndarray) -> np.ndarray:
+    """Return whether each of a test's distances from rest (k,) is less than one before it.
+
+    Measured ones may go back by 2 % of the largest, or by their noise, which second differences
+    show.
+    """
+    bends, tolerance = np.abs(np.diff(way, 2)), _BACK * way.max()
+    if len(way) >= _FEWEST_NOISY:
+        noise = np.median(bends) / _SD_OF_SECOND_DIFFERENCE
+        tolerance = max(tolerance, min(_NOISE * noise, _MOST_BACK * way.max()))
+    return np.maximum.accumulate(way) - way > tolerance
+
+
+def _through_rest(H: np.ndarray) -> bool:
+    """Return whether the states (k, 3, 3) of a test lie on one line through rest, in order."""
+    flat = H.reshape(len(H), -1)
+    along = flat @ (flat[-1] - flat[0])
+    steps = np.diff(along)
+    return bool(along[0] < 0.0 < along[-1] and (steps > -_BACK * np.ptp(along)).all())

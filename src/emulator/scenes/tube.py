@@ -37,12 +37,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.errors import InputError
-from emulator.scenes.states import STRETCHES, States, rows_of, with_unit
+from emulator.core.units import IN_MM, factor
+from emulator.scenes.states import STRETCHES, States, falls, rows_of, with_unit
 
 _RADIUS = re.compile(r"(inner|outer)_(radius|diameter)")
 _AXIAL = "stretch_axial"
-_IN_MM = {"": 1.0, "mm": 1.0, "cm": 10.0, "um": 1e-3, "µm": 1e-3, "m": 1e3}
-_BACK = 0.02  # share of a test's range by which a radius may go back, as measured ones do
 
 
 def motion_columns(words: Collection[str]) -> list[str]:
@@ -168,9 +167,8 @@ class Tube:
             )
         axial = np.asarray(columns[names[_AXIAL]], dtype=float)
         word = names[radii[0]]
-        if (unit := with_unit(word)[1]) not in _IN_MM:
-            raise InputError(f"column '{word}': unit '{unit}' is unknown; one of mm, cm, um, m")
-        radius = np.asarray(columns[word], dtype=float) * _IN_MM[unit]
+        radius = np.asarray(columns[word], dtype=float)
+        radius = radius * factor(word, with_unit(word)[1], "mm", IN_MM)
         radius = 0.5 * radius if radii[0].endswith("diameter") else radius
         wall = np.zeros(len(axial))
         if radii[0].startswith("outer"):
@@ -221,12 +219,18 @@ class Tube:
 
 def _check_path(inner: np.ndarray, axial: np.ndarray, rows: np.ndarray, name: str) -> None:
     """Refuse a test in which the radius falls while the stretch does not grow."""
-    fell = np.diff(inner) < -_BACK * max(np.ptp(inner), 1e-9)
-    back = np.flatnonzero(fell & (np.diff(axial) <= 0.0))
+    way = inner - inner.min()
+    # Where the stretch has grown, the radius may have shrunk with it.
+    back = np.flatnonzero(falls(way) & (axial <= axial[_largest_before(way)]))
     if len(back):
         test = f" of '{name}'" if name else ""
         raise InputError(
-            f"row {rows[back[0] + 1] + 1}{test} has a smaller radius than the one before: "
+            f"row {rows[back[0]] + 1}{test} has a smaller radius than one before: "
             "deflation goes under 'unloading' in a column 'branch', another test under another "
             "name in a column 'protocol'"
         )
+
+
+def _largest_before(way: np.ndarray) -> np.ndarray:
+    """Return the row (k,) of the largest of ``way`` (k,) up to each row."""
+    return np.maximum.accumulate(np.where(way == np.maximum.accumulate(way), range(len(way)), 0))

@@ -1,5 +1,7 @@
 """Tables of points over frames: three formats, what cannot be, and the data they become."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -10,9 +12,11 @@ from calibrate.measurements.full_field import (
     read_amounts,
     read_curve,
     read_full_field,
+    sign_of,
     spread_points,
 )
 from emulator.core.errors import InputError
+from emulator.scenes.parameter_space import Parameter
 from scene_support import between_plates
 
 AMOUNTS = {"0": 0.0, "3": 0.5, "6": 1.0, "9": 1.5, "12": 2.0}
@@ -83,9 +87,26 @@ def test_amounts_and_curves_are_read_by_name(tmp_path):
     (tmp_path / "pads.csv").write_text("frame,ux\n0,0\n3,-0.5\n")
     assert read_amounts(tmp_path / "pads.csv", "ux") == {"0": 0.0, "3": -0.5}
     (tmp_path / "force.csv").write_text("u,F\n-0.2,-2\n-0.1,-1\n")
-    amounts, force = read_curve(tmp_path / "force.csv", "u", "F")
-    np.testing.assert_array_equal(amounts, [0.1, 0.2])
-    np.testing.assert_array_equal(force, [-1.0, -2.0])
+    # A sensor may count the other way round; compression is no tension otherwise.
+    for like, expected in ([1.0], [0.1, 0.2]), ([-1.0], [-0.2, -0.1]), ([], [-0.2, -0.1]):
+        amounts, force = read_curve(tmp_path / "force.csv", "u", "F", like)
+        np.testing.assert_array_equal(amounts, expected)
+        np.testing.assert_array_equal(np.sort(force), [-2.0, -1.0])
+    (tmp_path / "cycle.csv").write_text("u,F\n" + "0,0\n1,1\n2,3\n1,0.5\n0,0\n" * 2)
+    with pytest.raises(InputError, match="'u' goes back at row 4: a curve of loading and"):
+        read_curve(tmp_path / "cycle.csv", "u", "F")
+    (tmp_path / "twice.csv").write_text("frame,ux\n3,0.1\n3,0.5\n")
+    with pytest.raises(InputError, match="row 2 is of frame '3', and so is one before"):
+        read_amounts(tmp_path / "twice.csv", "ux")
+
+
+def test_a_pull_keeps_its_sign_unless_the_scene_knows_one_alone():
+    amounts = {"1": 0.0, "2": -0.5}
+    signed = [Parameter("pull", "", low, 1.0) for low in (0.0, -1.0)]
+    scenes = [SimpleNamespace(parameters=(parameter,)) for parameter in signed]
+    assert [sign_of(scene, "pull", amounts) for scene in scenes] == [-1.0, 1.0]
+    assert sign_of(scenes[0], "pull", {"1": -0.5, "2": 0.5}) == 1.0
+    assert sign_of(scenes[0], "pull", {"1": 0.0, "2": 0.5}) == 1.0
 
 
 def test_points_are_spread_over_the_field():

@@ -112,7 +112,7 @@ def test_a_table_is_read_in_its_units(tmp_path):
         ("stretch_x,stress_x\n1,0\n1.2,1\n", "2 rows say how the specimen moves"),
         ("stretch_x,stress_x\n1,0\n1.1,1\n1.3,2\n", "row 3 moves otherwise"),
         ("stretch_x,stress_x\n1,0\n1.1,-1\n1.2,-3\n", "pulls against the motion"),
-        ("stretch_x,stress_x [psi]\n1,0\n1.1,1\n1.2,2\n", "unit 'psi' is unknown"),
+        ("stretch_x,stress_x [furlong]\n1,0\n1.1,1\n1.2,2\n", "unit 'furlong' is unknown"),
         ("stretch_x,force_x\n1,0\n1.1,1\n1.2,2\n", "give the area at rest"),
         ("stretch_x\n1\n1.1\n1.2\n", "column 'stress_x' is missing"),
         ("stress_x\n1\n1.1\n1.2\n", "column 'stretch_x' is missing"),

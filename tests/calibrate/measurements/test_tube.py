@@ -142,7 +142,7 @@ def test_a_table_of_diameters_is_read_and_written(tmp_path):
     path = tmp_path / "tube.csv"
     lines = ["outer_diameter [um],stretch_axial,pressure [mmHg],force_axial [g]"]
     rows = zip(
-        2e3 * outer, COLUMNS["stretch_axial"], pressure / 0.13332239, force / 9.80665, strict=True
+        2e3 * outer, COLUMNS["stretch_axial"], pressure / 0.133322, force / 9.80665, strict=True
     )
     path.write_text("\n".join([*lines, *(",".join(map(repr, map(float, r))) for r in rows)]))
     observe, data, _ = read_measurements(scene, path)
@@ -159,7 +159,7 @@ def test_a_table_of_diameters_is_read_and_written(tmp_path):
     ("columns", "told"),
     [
         ({"outer_radius": [0.5], "stretch_axial": [1.3]}, "no cavity"),
-        ({"inner_radius": [2600.0], "stretch_axial": [1.3]}, "outside 0.2 to 5"),
+        ({"inner_radius": [2600.0], "stretch_axial": [1.3]}, "outside 0.1 to 12"),
         ({"inner_radius": [2.6]}, "give stretch_axial and one of"),
         ({"inner_radius": [2.6], "outer_radius": [3.0], "stretch_axial": [1.3]}, "one of"),
         ({"inner_radius [inch]": [2.6], "stretch_axial": [1.3]}, "unit 'inch' is unknown"),

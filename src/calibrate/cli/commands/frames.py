@@ -39,7 +39,9 @@ from emulator.core.store import check_folder
     option(
         "--force",
         "REACTION=FILE:AMOUNT:COLUMN",
-        "of a full field, a force (N) such as reaction:pad:x, and its curve over the amount",
+        "of a full field, forces (N) such as reaction:pad:x, each with its curve over the amount",
+        nargs="+",
+        default=(),
     ),
     option("--only", "FRAME", "frames of a full field that are data (default: all)", nargs="+"),
     option(
@@ -94,6 +96,7 @@ def _full_field(arguments: Namespace) -> Answer:
         read_amounts,
         read_curve,
         read_full_field,
+        sign_of,
         spread_points,
     )
     from calibrate.state_names import in_state
@@ -103,17 +106,21 @@ def _full_field(arguments: Namespace) -> Answer:
         raise InputError("--field: give one or two files, and --amount PARAMETER=FILE:COLUMN")
     parameter, path, column = _split(arguments.amount, "--amount", "PARAMETER=FILE:COLUMN")
     field = read_full_field(*arguments.field)
-    amounts = {frame: abs(value) for frame, value in read_amounts(path, column).items()}
+    amounts = read_amounts(path, column)
+    sign = sign_of(scene, parameter, amounts)
+    amounts = {frame: sign * amount for frame, amount in amounts.items()}
     moved = [frame for frame in field.frames if amounts.get(frame) != 0.0]
     count = min(arguments.points, len(field.points))
     field = field.only(arguments.only or moved, spread_points(field.points, count))
     observe, data = field_data(scene, field, amounts)
     parts = dict(observe.parts)
-    if arguments.force is not None:
+    for each in arguments.force:
         usage = "REACTION=FILE:AMOUNT:COLUMN"
-        word, path, *columns = _split(arguments.force, "--force", usage)
-        at, force = read_curve(path, *columns)
+        word, path, *columns = _split(each, "--force", usage)
+        at, force = read_curve(path, *columns, list(amounts.values()))
         ((name, part),) = parse_observation(scene, word, 0).parts.items()
+        if in_state(name, field.frames[0]) in parts:
+            raise InputError(f"--force: {word} is given twice; give one curve for each")
         for frame in field.frames:
             if not at[0] <= amounts[frame] <= at[-1]:
                 raise InputError(

@@ -46,6 +46,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.errors import InputError
+from emulator.core.units import KPA_PER_MMHG
 from emulator.geometry.discretisation import Discretisation, FacetRule, facet_rule
 from emulator.geometry.facets import Cavity, cone_volume, lids, nodal_area_vectors, rim
 from emulator.geometry.mesh import Mesh
@@ -53,8 +54,6 @@ from emulator.mechanics.kinematics import cofactor
 from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.part import Load, LocalForce, LocalTerm, Prescribed, Values, sums
 from emulator.scenes.tissue import Fibres
-
-KPA_PER_MMHG = 0.133322
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,47 @@
+"""Units of columns and words, with the factors to the project's own: mm, kPa, mN and mL.
+
+Names of units are matched as they are written, then whatever their case: ``KPa`` is kPa. A name
+that begins with a small m is not: ``mPa`` is neither MPa nor Pa.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from emulator.core.errors import InputError
+
+KPA_PER_MMHG = 0.133322
+
+IN_KPA = {
+    "kPa": 1.0, "Pa": 1e-3, "MPa": 1e3, "N/mm2": 1e3, "N/cm2": 10.0, "N/m2": 1e-3, "mN/mm2": 1.0,
+    "mmHg": KPA_PER_MMHG, "psi": 6.894757, "kgf/cm2": 98.0665, "gf/cm2": 0.0980665,
+    "g/cm2": 0.0980665, "bar": 100.0, "dyn/cm2": 1e-4,
+}  # fmt: skip
+"""Stresses and pressures."""
+IN_MN = {"mN": 1.0, "N": 1e3, "g": 9.80665, "gf": 9.80665, "kgf": 9806.65, "kN": 1e6}
+"""Forces."""
+IN_MM = {"mm": 1.0, "cm": 10.0, "um": 1e-3, "µm": 1e-3, "m": 1e3}
+"""Lengths."""
+IN_MM2 = {"mm2": 1.0, "cm2": 100.0, "m2": 1e6}
+"""Areas."""
+IN_ML = {"mL": 1.0, "ml": 1.0, "cm3": 1.0, "mm3": 1e-3, "uL": 1e-3, "µL": 1e-3, "L": 1e3, "m3": 1e6}
+"""Volumes."""
+
+
+def factor(word: str, unit: str, usual: str, known: Mapping[str, float]) -> float:
+    """Return the factor from the unit of column ``word``, ``usual`` where it has none.
+
+    :class:`InputError` for a unit that is not ``known``.
+    """
+    plain = unit.replace("²", "2").replace("³", "3").replace("^", "").replace(" ", "") or usual
+    alike = [each for each in known if each.lower() == plain.lower()]
+    if plain not in known and len(alike) == 1 and not plain.startswith("m"):
+        (plain,) = alike
+    if plain not in known:
+        raise InputError(f"column '{word}': unit '{unit}' is unknown; one of {', '.join(known)}")
+    return known[plain]
+
+
+def other_units(known: Mapping[str, float], *names: str) -> dict[str, float]:
+    """Return the factors of units ``names`` that data may be in by mistake."""
+    return {name: known[name] for name in names}

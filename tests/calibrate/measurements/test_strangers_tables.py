@@ -1,0 +1,138 @@
+"""Tables of tests as people save them: read, or refused in a line that says what would be right."""
+
+import numpy as np
+import pytest
+
+from calibrate.measurements.data import read_measurements
+from calibrate.project.specimen import draft_specimen
+from emulator.core.cells import read_cells
+from emulator.core.errors import InputError
+from emulator.scenes.file import read_scene
+from emulator.scenes.specimen import read_states
+from emulator.scenes.tube import Tube
+
+STRETCH = np.linspace(1.0, 1.2, 30)
+STRESS = 10.0 * (STRETCH - STRETCH**-2)
+
+
+def table(path, header, *columns):
+    rows = [",".join(map(str, row)) for row in zip(*columns, strict=True)]
+    path.write_text("\n".join([header, *rows, ""]))
+    return path
+
+
+def draft(tmp_path, header, *columns, **options):
+    source = table(tmp_path / "test.csv", header, *columns)
+    return draft_specimen(source, tmp_path / "x.toml", **options)
+
+
+def refusal(tmp_path, header, *columns, **options):
+    with pytest.raises(InputError) as caught:
+        draft(tmp_path, header, *columns, **options)
+    assert len(str(caught.value).splitlines()) == 1
+    assert not list(tmp_path.glob("*.toml"))
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("unit", ["N/mm2", "MPa", "N/mm^2", "MPA", "N/mm²"])
+def test_units_of_stress_are_those_of_machines(tmp_path, unit):
+    path = table(tmp_path / "t.csv", f"stretch_x,stress_x [{unit}]", STRETCH, 1e-3 * STRESS)
+    draft_specimen(path, tmp_path / "x.toml")
+    _, data, _ = read_measurements(read_scene(tmp_path / "x_scene.toml"), path)
+    np.testing.assert_allclose(data["stress"].ravel(), STRESS, rtol=1e-9)
+
+
+def test_markers_that_go_back_by_their_noise_are_loading_and_dense_cycles_are_not(tmp_path):
+    noise = 0.0015 * np.random.default_rng(0).normal(size=60)
+    noisy = np.linspace(1.0, 1.15, 60) + noise
+    assert "60 states" in draft(tmp_path, "stretch_x,stress_x", noisy, noisy - 1.0).notes[0]
+    way = 1.0 + 0.1 * np.sin(np.linspace(0.0, 3.0 * np.pi, 720)) ** 2
+    (tmp_path / "x.toml").unlink()
+    (tmp_path / "x_scene.toml").unlink()
+    assert "nearer to rest than one before" in refusal(
+        tmp_path, "stretch_x,stress_x", way, way - 1.0
+    )
+    tube = Tube(0.36, (0.1,))
+    words = "inner_radius,stretch_axial,pressure"
+    radius = 0.4 + 0.2 * (way - 1.0)
+    told = refusal(tmp_path, words, radius, np.full(720, 1.2), way - 1.0, tube=tube)
+    assert "smaller radius than one before" in told
+
+
+def test_a_strain_of_more_than_one_says_whether_it_is_in_percent(tmp_path):
+    strain = np.linspace(0.0, 3.8, 30)
+    told = refusal(tmp_path, "strain_x,stress_x", strain, strain)
+    assert "'strain_x [%]' if it is in percent, 'strain_x [-]' if it is not" in told
+    assert "stress reaches" in " ".join(
+        draft(tmp_path, "strain_x [-],stress_x", strain, strain).notes
+    )
+    reached = [read_states(table(tmp_path / "u.csv", f"strain_x [{unit}],stress_x", strain, strain))
+               .gradients[-1, 0, 0] for unit in ("%", "-")]  # fmt: skip
+    np.testing.assert_allclose(reached, [0.038, 3.8])
+
+
+def test_one_measurement_counts_once(tmp_path):
+    told = refusal(
+        tmp_path, "stretch_x,stress_x [kPa],cauchy_x [kPa]", STRETCH, STRESS, STRESS * STRETCH
+    )
+    assert "columns 'stress_x [kPa]' and 'cauchy_x [kPa]' both have a stress of row 1" in told
+    told = refusal(tmp_path, "stretch_x,stress_x [kPa],stress_x [MPa]", STRETCH, STRESS, STRESS)
+    assert "would count twice" in told
+    tests = np.repeat(["a", "b", "c"], 30)
+    again = np.tile(STRETCH, 3), np.tile(STRESS, 3)
+    told = refusal(tmp_path, "protocol,stretch_x,stress_x", tests, *again)
+    assert "tests 'a' and 'b' have the same 30 rows" in told
+    noise = 0.01 * np.arange(90)
+    draft(tmp_path, "protocol,stretch_x,stress_x", tests, again[0], again[1] + noise)
+    # Two measures of a stress in rows of their own are two measurements.
+    (tmp_path / "x.toml").unlink()
+    (tmp_path / "x_scene.toml").unlink()
+    first = [*STRESS[:15], *[""] * 15], [*[""] * 15, *STRESS[15:]]
+    draft(tmp_path, "stretch_x,stress_x,cauchy_x", STRETCH, *first)
+
+
+def test_spreadsheets_leave_empty_rows_and_columns(tmp_path):
+    text = "stretch_x,stress_x,\n" + "".join(
+        f"{a},{b},\n" for a, b in zip(STRETCH, STRESS, strict=True)
+    )
+    (tmp_path / "t.csv").write_text(text + ",,\n,,\n")
+    cells = read_cells(tmp_path / "t.csv")
+    assert (list(cells.words), len(cells.rows)) == (["stretch_x", "stress_x"], 30)
+    assert "30 states" in draft_specimen(tmp_path / "t.csv", tmp_path / "x.toml").notes[0]
+
+
+def test_a_shear_may_begin_at_zero_and_a_row_without_any_motion_may_not(tmp_path):
+    shear = np.linspace(0.0, 0.4, 30)
+    assert "30 states" in draft(tmp_path, "shear_xy,stress_xy", shear, 3.0 * shear).notes[0]
+    (tmp_path / "x.toml").unlink()
+    (tmp_path / "x_scene.toml").unlink()
+    told = refusal(tmp_path, "shear_xy,stress_xy", ["", *shear[1:]], 3.0 * shear)
+    assert "row 1 has no stretch and no shear" in told
+
+
+def test_what_goes_through_rest_or_only_unloads_is_named(tmp_path):
+    sweep = np.linspace(0.9, 1.1, 21)
+    told = refusal(tmp_path, "stretch_x,stress_x", sweep, sweep - 1.0)
+    assert "go through rest" in told
+    told = refusal(tmp_path, "branch,stretch_x,stress_x", ["unloading"] * 30, STRETCH, STRESS)
+    assert "each row is unloading" in told
+
+
+def test_columns_of_another_convention_are_named(tmp_path):
+    told = refusal(tmp_path, "lambda_x,sigma_xx [MPa]", STRETCH, STRESS)
+    assert "call lambda_x stretch_x, sigma_xx [MPa] cauchy_x [MPa]" in told
+    told = refusal(tmp_path, "elongation,load", STRETCH, STRESS)
+    assert "it has elongation, load" in told
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("stretch_x;stress_x\n1;0\n1,1;1,234\n1,2;987.6\n", "'1,1' and row 3"),
+        ("stretch_x,stress_x\n1,0\n1.1,5_7\n", "'5_7', not a number"),
+    ],
+)
+def test_numbers_that_may_be_two_are_refused(tmp_path, text, line):
+    (tmp_path / "t.csv").write_text(text)
+    with pytest.raises(InputError, match=line):
+        draft_specimen(tmp_path / "t.csv", tmp_path / "x.toml")
