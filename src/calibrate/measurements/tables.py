@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,8 @@ from calibrate.state_names import in_state, split, states_of
 from emulator.core import store
 from emulator.core.cells import TEXT, Cells, read_cells
 from emulator.core.errors import InputError
+from emulator.core.units import IN_KPA, IN_ML, IN_MM, factor
+from emulator.scenes.states import with_unit
 
 STATE = "state"
 """Column of a CSV file that names the load state of a row."""
@@ -97,12 +100,42 @@ class CSVTable:
         return arrays
 
 
+_UNITS = (
+    (re.compile(r"volume(:.+)?"), "mL", IN_ML),
+    (re.compile(r"u?[xyz]"), "mm", IN_MM),
+    (re.compile(r"known:.*pressure.*"), "kPa", IN_KPA),
+)
+"""Columns that may have units in brackets besides those of specimens, and the project's unit."""
+
+
+def _without_units(cells: Cells) -> Cells:
+    """Return a table with columns such as ``volume [L]`` in the project's units, without them."""
+    own: dict[str, tuple[str, float]] = {}
+    for word in cells.words:
+        name, unit = with_unit(word)
+        found = next((each for each in _UNITS if each[0].fullmatch(name)), None)
+        if unit and found is not None:
+            if name in (*cells.words, *(known for known, _ in own.values())):
+                raise InputError(f"data file {cells.path}: column '{name}' is there twice")
+            own[word] = name, factor(word, unit, *found[1:])
+    if not own:
+        return cells
+
+    def converted(row: int, word: str, cell: str) -> tuple[str, str]:
+        name, each = own.get(word, (word, 1.0))
+        number = cells.number(row, word, gaps=True) if each != 1.0 else 0.0
+        return name, cell if each == 1.0 or np.isnan(number) else repr(float(number * each))
+
+    rows = {k: dict(converted(k, w, c) for w, c in row.items()) for k, row in cells.rows.items()}
+    return cells._replace(words=[own.get(w, (w, 1.0))[0] for w in cells.words], rows=rows)
+
+
 def read_csv(path: Path) -> dict[str, CSVTable]:
     """Return the table of each load state, by the column ``state`` or a loading curve's rows.
 
     One empty name where the file names no state.
     """
-    whole = read_cells(path)
+    whole = _without_units(read_cells(path))
     words, rows = whole.words, whole.rows
     curve = any(w.startswith(KNOWN) for w in words) and not {STATE, *_PLACES} & set(words)
     if STATE not in words and not curve:

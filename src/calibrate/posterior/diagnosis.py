@@ -132,15 +132,11 @@ class Summary(dict[str, dict[str, float]]):
         rows = [["", *columns]]
         rows += [[name, *(f"{row[each]:.4g}" for each in columns)] for name, row in self.items()]
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        return "\n".join(
-            "  ".join(
-                [
-                    row[0].ljust(widths[0]),
-                    *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True)),
-                ]
-            )
-            for row in rows
-        )
+        lines = []
+        for row in rows:
+            cells = [cell.rjust(width) for cell, width in zip(row, widths, strict=True)]
+            lines.append("  ".join([row[0].ljust(widths[0]), *cells[1:]]))
+        return "\n".join(lines)
 
     __str__ = __repr__
 

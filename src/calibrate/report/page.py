@@ -159,8 +159,8 @@ def _known(posterior: Posterior) -> list[Markup]:
         full, empty = (pick(medians, key=medians.__getitem__) for pick in (max, min))
         ejected = parts.median_and_range(100.0 * (1.0 - volumes[empty] / volumes[full]))
         text = (
-            f"The cavity is smaller in {empty} than in {full} by {ejected} %: the ejection fraction, "
-            "if the heart beats in between."
+            f"The cavity is smaller in {empty} than in {full} by {ejected} %: the ejection "
+            "fraction, if the heart beats in between."
         )
         head = ("load state", "cavity volume (mL), median and 90 %")
         blocks += [parts.table(head, rows), parts.paragraph(text)]

@@ -98,7 +98,8 @@ class SceneFile(Table):
     """in place of mesh, a table (CSV or spreadsheet) of the states of a tested specimen, relative
     to this file: docs/specimens.md."""
     grips: GripsTable | Literal["none"] | None = None
-    """how the specimen was held; without it, states are homogeneous and nothing else is asked."""
+    """how the specimen was held; "none" where its grips are far from what was measured. Without it,
+    the verdict says that nobody told."""
     tube: TubeTable | None = None
     """of a specimen that is a tube, whose table has radii and stretch_axial."""
     parameters: dict[str, ParameterTable]

@@ -3,9 +3,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibrate.certificate.evidence import Changes, Evidence, Figure, Physics, Tail
+from calibrate.certificate.evidence import (
+    NOBODY_SAID,
+    SAID_HOMOGENEOUS,
+    Changes,
+    Evidence,
+    Figure,
+    MeshChange,
+    Physics,
+    Tail,
+)
 from calibrate.certificate.verdict import judge
 from calibrate.posterior.diagnosis import Misfit, Sampling
+from calibrate.posterior.taken_up import TakenUp
 
 
 def changes(shift=0.0, error=0.01, log_sd=0.0, correlation=0.0):
@@ -182,3 +192,27 @@ def test_a_figure_at_its_limit_is_seldom_within_it_at_one_of_three_looks():
     errors = np.random.default_rng(0).normal(size=(40_000, 3))
     within = [any(Figure(10.0 + e, 1.0).within(10.0) for e in looks) for looks in errors]
     assert np.mean(within) == pytest.approx(0.0244, abs=4 * np.sqrt(0.0244 / 40_000))
+
+
+@pytest.mark.parametrize(("said", "remedy"), [(NOBODY_SAID, True), (SAID_HOMOGENEOUS, False)])
+def test_a_specimen_without_grips_is_accepted_on_an_assumption_that_is_named(said, remedy):
+    mesh = MeshChange(why="its states are homogeneous on any mesh", homogeneous=said)
+    certificate = judge(replace(RIGHT, mesh=mesh))
+    assert certificate.verdict == "accepted"
+    assert certificate.reason.endswith(f"if the piece deforms evenly, {said}")
+    assert certificate.findings[-1].startswith(
+        f"grips: the piece is taken to deform evenly, {said}"
+    )
+    assert ("give [grips] in the scene file" in certificate.findings[-1]) is remedy
+    assert "any mesh" not in " ".join(certificate.findings)
+
+
+def test_inferred_noise_is_told_as_a_share_of_the_signal():
+    small = TakenUp("stress", "kPa", 0.1, 10.0, 0.08, 0.3)
+    large = replace(small, sd=2.0)
+    assert "of stress is 0.1 kPa, 1 % of the largest (10 kPa)" in verdict(noise=(small,))[1]
+    found, words = verdict(noise=(large,))
+    assert found == "accepted"
+    assert "is 2 kPa, 20 % of the largest" in words
+    assert "the law misses the data by more than they scatter" in words
+    assert "the law misses" not in verdict(noise=(small,))[1]

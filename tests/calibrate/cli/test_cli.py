@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 import emulator as em
-from calibrate.cli import COMMANDS, main
+from calibrate.cli import COMMANDS, build_parser, main
+from calibrate.cli.run_words import problem_of
 from calibrate.cli.words import seconds
 from cli_support import SCENE, answer, complaint, write_block
+from emulator.core.errors import InputError
 
 
 @pytest.fixture
@@ -182,3 +184,23 @@ def test_evaluate_against_the_released_solutions(capsys, published, tmp_path):
     assert "is not the scene 'once_clamped_beam'" in complaint(
         capsys, "evaluate", "once_clamped_beam", "--against", folder
     )
+
+
+def test_no_repeated_option_is_lost(tmp_path, monkeypatch, capsys):
+    """argparse keeps the last one alone, in silence."""
+    monkeypatch.chdir(tmp_path)
+    words = [*INFER_TWICE, "--noise", "volume=20", "--noise", "displacement=0.3"]
+    problem = problem_of(build_parser("infer").parse_args(words))
+    assert problem.run.noise == {"volume": 20.0, "displacement": 0.3}
+    assert problem.run.truth == {"a": 1.0, "b": 2.0, "a_f": 6.0, "b_f": 2.0, "pressure": 1.0}
+    for repeated in (["--noise", "volume=3"], ["--truth", "a=1"]):
+        with pytest.raises(InputError, match="is given twice"):
+            problem_of(build_parser("infer").parse_args([*words, *repeated]))
+    assert main([*words, "--seed", "1", "--seed", "2"]) == 2
+    assert capsys.readouterr().err.strip().startswith("calibrate: --seed is given twice")
+
+
+INFER_TWICE = (
+    "infer", "left_ventricle", "--truth", "a=1", "b=2", "--truth", "a_f=6", "b_f=2", "pressure=1",
+    "--observe", "landmarks:24+volume", "--out", "run",
+)  # fmt: skip

@@ -136,3 +136,22 @@ def test_numbers_that_may_be_two_are_refused(tmp_path, text, line):
     (tmp_path / "t.csv").write_text(text)
     with pytest.raises(InputError, match=line):
         draft_specimen(tmp_path / "t.csv", tmp_path / "x.toml")
+
+
+def test_volumes_pressures_and_places_may_have_units(tmp_path, ventricle):
+    own = "volume,known:pressure\n0.118,0.68\n0.1225,0.84\n"
+    (tmp_path / "kpa.csv").write_text(own)
+    text = "volume [mm3],known:pressure [mmHg]\n118.0,{!r}\n122.5,{!r}\n"
+    (tmp_path / "mmhg.csv").write_text(text.format(0.68 / 0.133322, 0.84 / 0.133322))
+    (_, data, known), (_, other, again) = (
+        read_measurements(ventricle, tmp_path / f"{name}.csv") for name in ("kpa", "mmhg")
+    )
+    assert known == pytest.approx(again)
+    assert data.keys() == other.keys()
+    for name, values in data.items():
+        np.testing.assert_allclose(values, other[name], rtol=1e-12)
+    (tmp_path / "bad.csv").write_text("volume [pt],known:pressure\n118.0,0.68\n")
+    with pytest.raises(
+        InputError, match=r"column 'volume \[pt\]': unit 'pt' is unknown; one of mL"
+    ):
+        read_measurements(ventricle, tmp_path / "bad.csv")

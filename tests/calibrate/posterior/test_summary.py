@@ -1,5 +1,7 @@
 """The summary's effective draws are those that a run is stopped by."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -21,3 +23,14 @@ def test_tail_ess_is_of_the_quantiles_that_a_run_is_stopped_by():
     assert row["ess_tail"] == pytest.approx(float(for_stopping))
     assert abs(float(for_stopping) - float(inner)) > 1.0
     assert min(row["ess_bulk"], row["ess_tail"]) == pytest.approx(least_ess(values))
+
+
+def test_a_summary_prints_as_a_table():
+    draws = np.random.default_rng(0).normal(size=(4, 100))
+    table = summary_of({"a": draws, "long_name": 1e3 * draws})
+    lines = str(table).splitlines()
+    assert lines[0].split() == list(table["a"])
+    assert [line.split()[0] for line in lines[1:]] == ["a", "long_name"]
+    assert len(set(map(len, lines))) == 1
+    assert repr(table) == str(table)
+    assert json.loads(json.dumps(table)) == table

@@ -213,3 +213,23 @@ def test_a_prior_entirely_outside_the_box(beam):
     prior = {**cal.box_prior(beam), "mu": dist.Uniform(200.0, 300.0)}
     with pytest.raises(InputError, match="prior Uniform lies outside 50 to 100"):
         cal.truncated(prior, beam)
+
+
+@pytest.mark.parametrize(
+    ("base", "low", "high"),
+    [
+        (dist.Normal(1.0, 0.5), 6.0, 7.0),
+        (dist.Normal(1.0, 0.5), -5.0, -4.0),
+        (dist.StudentT(4.0, 1.0, 0.5), 6.0, 7.0),
+        (dist.LogNormal(0.0, 0.3), 20.0, 40.0),
+    ],
+)
+def test_a_tail_of_a_distribution_has_a_finite_density_that_integrates_to_one(base, low, high):
+    """Ten sds away, where the cumulative distribution function is 1 to round-off."""
+    tail = Truncated(base, low, high)
+    x = np.linspace(low, high, 20_001)
+    density = np.exp(np.asarray(tail.log_prob(x)))
+    assert np.trapezoid(density, x) == pytest.approx(1.0, rel=1e-4)
+    np.testing.assert_allclose(tail.cdf(jnp.array([low, high])), [0.0, 1.0], atol=1e-12)
+    quantile = float(tail.icdf(jnp.array(0.5)))
+    assert np.trapezoid(density[x <= quantile], x[x <= quantile]) == pytest.approx(0.5, abs=2e-3)

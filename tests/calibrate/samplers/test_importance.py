@@ -103,6 +103,36 @@ def test_narrow_modes_far_apart_in_five_dimensions(seed):
     assert draws.attributes["effective_points"] >= 2.0 * draws.z[..., 0].size
 
 
+def test_light_and_narrow_modes_keep_their_shares():
+    """Five modes in three unknowns, shares 0.5 to 0.04, sds a two-hundredth of the prior's."""
+    shares = np.array([0.5, 0.26, 0.12, 0.08, 0.04])
+    centres = jnp.asarray(np.random.default_rng(4).normal(0.0, 3.0, size=(5, 3)))
+    weights = jnp.log(jnp.asarray(shares)) - norm.logpdf(centres, 0.0, SD).sum(axis=1)
+
+    def log_likelihood(z):
+        return jax.nn.logsumexp(norm.logpdf(z, centres, 0.02).sum(axis=1) + weights)
+
+    draws = sampled(density(log_likelihood, 3))
+    nearest = np.argmin(((draws.z[..., None, :] - np.asarray(centres)) ** 2).sum(axis=-1), axis=-1)
+    found = np.bincount(nearest.ravel(), minlength=5) / nearest.size
+    np.testing.assert_allclose(found, shares, atol=5.0 * np.sqrt(0.25 / 2600))
+    assert found[-1] == pytest.approx(0.04, abs=0.02)
+    attributes = draws.attributes
+    assert (attributes["modes"], attributes["modes_seen_once"]) == (5, 0)
+    assert attributes["missed_mode_nats"] == np.inf
+    error = attributes["log_evidence_error"]
+    assert 0.0 < error < 0.05
+    assert abs(attributes["log_evidence"]) < 4.0 * error
+
+
+def test_modes_that_one_population_saw_are_told():
+    draws = {"z": np.random.default_rng(0).normal(size=(4, 500))}
+    row = {"z": {"r_hat": 1.0, "ess_bulk": 2000.0, "ess_tail": 2000.0}}
+    assert list(diagnose(draws, {}, row, {"modes": 3, "modes_seen_once": 0})) == []
+    (sentence,) = diagnose(draws, {}, row, {"modes": 3, "modes_seen_once": 1})
+    assert sentence.startswith("1 of 3 modes were seen by one population only")
+
+
 def test_draws_of_points_that_are_worth_twice_as_many_are_worth_two_thirds():
     """The spread of means over sets of weighted points: sigma^2 (1 / n + 1 / m) at most."""
     rng, count = np.random.default_rng(3), 100

@@ -117,7 +117,7 @@ def _full_field(arguments: Namespace) -> Answer:
     for each in arguments.force:
         usage = "REACTION=FILE:AMOUNT:COLUMN"
         word, path, *columns = _split(each, "--force", usage)
-        at, force = read_curve(path, *columns, list(amounts.values()))
+        at, force = read_curve(path, columns[0], columns[1], list(amounts.values()))
         ((name, part),) = parse_observation(scene, word, 0).parts.items()
         if in_state(name, field.frames[0]) in parts:
             raise InputError(f"--force: {word} is given twice; give one curve for each")
