@@ -11,8 +11,9 @@ from arviz_stats.base import array_stats
 from studies.fem_posterior.problems import Problem
 
 import calibrate as cal
+from calibrate.importance import transport
 from calibrate.posterior import Posterior
-from calibrate.samplers import density_of, named_draws, transport
+from calibrate.samplers import density_of, named_draws
 from calibrate.samplers.chains import compile_chains
 from calibrate.samplers.nuts import NUTS, NUTSOptions
 from calibrate.statistical_model import FEMLikelihood

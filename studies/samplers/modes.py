@@ -12,6 +12,7 @@ import argparse
 import warnings
 from dataclasses import dataclass
 from time import perf_counter
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -56,9 +57,9 @@ class Zigzag:
 @dataclass(frozen=True, eq=False)
 class Modes:
     name: str
-    model: object
+    model: Any
     data: np.ndarray
-    forward: object
+    forward: Any
     bends: tuple[Zigzag, ...]
     log_evidence: float
     shares: np.ndarray

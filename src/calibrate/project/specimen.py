@@ -27,6 +27,7 @@ _MODULI = (0.005, 3.0)  # range of a modulus, as a share of the largest stress o
 _EXPONENTS = (0.1, 50.0)
 _KAPPA = 1e4  # bulk modulus, likewise: 1000 changes stresses of stretched fibres by 0.4 %
 _NOISE = 0.03  # scale of both sds of the noise, as a share of the largest stress
+_NO_GRIPS_PULLED = 'grips = "none"   # CHANGE: the verdict takes stresses to be even'
 _NO_GRIPS = (
     'grips = "none"   # CHANGE: the verdict takes stresses to be even; or [grips], at the end'
 )
@@ -97,7 +98,7 @@ def draft_specimen(
             for name, (part, most) in largest.items()
         ),
         f"ranges of moduli follow from a stiffness of {slope:.3g} kPa",
-        *([] if tube else ['stresses are even, grips = "none", or how it was held, [grips]']),
+        *([] if tube else ['grips = "none": stresses are taken to be even']),
         "incompressible, --forward homogeneous takes the law's kappa; FEM, which checks, takes it, "
         "too",
         *(
@@ -119,8 +120,9 @@ def draft_specimen(
     source = table.resolve()
     name = source.relative_to(folder) if source.is_relative_to(folder) else source
     scene_path.parent.mkdir(parents=True, exist_ok=True)
-    text = _scene_text(material, name.as_posix(), axes, slope, tube)
-    if tube is None and not given.pulls.any():
+    pulled = bool(given.pulls.any())
+    text = _scene_text(material, name.as_posix(), axes, slope, tube, pulled=pulled)
+    if tube is None and not pulled:
         text += "\n".join(["", *_GRIPS, ""])
     scene_path.write_text(text, encoding="utf-8")
     try:
@@ -187,11 +189,16 @@ def _stiffnesses(tube: Tube | None) -> list[str]:
     return [f"stiffness_{k + 1}" for k in range(layers)]
 
 
-def _scene_text(law: Law, table: str, axes: list[str], slope: float, tube: Tube | None) -> str:
-    """Return the scene file. Fibres are along the first axis that is pulled, sheets across it."""
+def _scene_text(
+    law: Law, table: str, axes: list[str], slope: float, tube: Tube | None, *, pulled: bool
+) -> str:
+    """Return the scene file. Fibres are along the first axis that moves, sheets across it.
+
+    pulled : whether the machine prescribes forces, which grips cannot have.
+    """
     lines = [f'law = "{law.name}"   # see docs/laws.md for others', f'specimen = "{table}"']
     if tube is None:
-        lines.append(_NO_GRIPS)
+        lines.append(_NO_GRIPS_PULLED if pulled else _NO_GRIPS)
     if law.fibres:
         first = axes[0] if axes else "x"
         second = next(a for a in [*axes[1:], *AXES] if a != first)

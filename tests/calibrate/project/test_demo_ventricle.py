@@ -136,7 +136,8 @@ def test_infer_takes_both_and_infers_a_noise(setting, folder, tmp_path, capsys):
     ],
 )
 def test_bad_words_about_volumes(setting, tmp_path, capsys, options, message):
-    words = ["infer", "left_ventricle", "--observe", "landmarks:3+volume"]
+    words = ["infer", "left_ventricle"]
+    words += [] if "--observe" in options else ["--observe", "landmarks:3+volume"]
     words += ["--truth", *(f"{name}={value}" for name, value in RUN.truth.items())]
     assert main([*words, *options, "--out", str(tmp_path / "r")]) == 2
     assert message in capsys.readouterr().err

@@ -10,10 +10,10 @@ from calibrate.samplers import (
     SAMPLERS,
     BlackJAXNUTSOptions,
     ChainOptions,
-    density,
     find_sampler,
     options_from,
 )
+from calibrate.statistical_model import density
 from calibrate.statistical_model.density import density_of
 from emulator.core.errors import InputError
 from emulator.surrogates.fem import fem_forward
