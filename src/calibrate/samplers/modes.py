@@ -110,24 +110,52 @@ def find_modes(
     draws : draws (s, p) of the posterior, if there are any; in coordinates in which they are white
         the optimiser takes a few steps, where a sharp posterior takes thousands.
     """
+    climb = _climber(density, data, draws)
+    ends = [end for end in map(climb, starts) if np.isfinite(end[1])]
+    ends = sorted(ends, key=lambda end: -end[1])
+    z = np.array([each for each, _ in ends]).reshape(len(ends), density.dimension)
+    return Modes(z, np.array([height for _, height in ends]))
+
+
+def _climber(
+    density: Density, data: Data, draws: np.ndarray | None
+) -> Callable[..., tuple[np.ndarray, float]]:
+    """Return the function from a start (p,) to where a climb ends, and the log density there.
+
+    A climb that comes to one of the modes ``known`` ends there.
+    """
     programs = programs_of(density)
     # From white coordinates w to z = factor w.
     factor = np.eye(density.dimension)
     if draws is not None and (covariance := _covariance(draws)) is not None:
         factor = np.linalg.cholesky(covariance)
 
-    def negative(w: np.ndarray) -> tuple[float, np.ndarray]:
-        height, slope = programs.value_and_gradient(jnp.asarray(factor @ w), data)
-        with np.errstate(invalid="ignore"):  # far away, where the slope is not finite
-            return -float(height), -(np.asarray(slope) @ factor)
+    def climb(start: np.ndarray, known: Sequence[Mode] = ()) -> tuple[np.ndarray, float]:
+        def negative(w: np.ndarray) -> tuple[float, np.ndarray]:
+            z = factor @ w
+            height, slope = programs.value_and_gradient(jnp.asarray(z), data)
+            for mode in known:
+                if mode.is_at(z, float(height)):
+                    raise _ArrivedError(mode)
+            with np.errstate(invalid="ignore"):  # far away, where the slope is not finite
+                return -float(height), -(np.asarray(slope) @ factor)
 
-    minima = [
-        minimise(negative, np.linalg.solve(factor, start), iterations=_MOST, tolerance=1e-12)
-        for start in starts
-    ]
-    minima = sorted((m for m in minima if np.isfinite(m.value)), key=lambda m: m.value)
-    z = np.array([factor @ m.x for m in minima]).reshape(len(minima), density.dimension)
-    return Modes(z, np.array([-m.value for m in minima]))
+        w = np.linalg.solve(factor, start)
+        try:
+            end = minimise(negative, w, iterations=_MOST, tolerance=1e-12)
+        except _ArrivedError as arrived:
+            return arrived.mode.z, arrived.mode.height
+        return factor @ end.x, -end.value
+
+    return climb
+
+
+class _ArrivedError(Exception):
+    """A climb came to a mode that is known."""
+
+    def __init__(self, mode: Mode) -> None:
+        super().__init__()
+        self.mode = mode
 
 
 class Mode(NamedTuple):
@@ -198,18 +226,16 @@ def explore(
 
     draws : as of :func:`find_modes`.
     """
-    modes: list[Mode] = []
-    for begin in range(0, len(starts), BATCH):
-        ends = find_modes(density, data, starts[begin : begin + BATCH], draws)
-        for z, height in zip(*ends, strict=True):
-            known = next((k for k, mode in enumerate(modes) if mode.is_at(z, height)), None)
-            if known is not None:
-                modes[known] = modes[known]._replace(climbs=modes[known].climbs + 1)
-            elif (mode := _mode_at(density, data, z, height)) is not None:
-                modes.append(mode)
-        modes = merged(modes)
-        if len(of_account(modes)) < 2:
+    climb, modes = _climber(density, data, draws), list[Mode]()
+    for number, start in enumerate(starts):
+        if number == BATCH and len(of_account(modes)) < 2:
             break
+        z, height = climb(start, modes)
+        known = next((k for k, mode in enumerate(modes) if mode.is_at(z, height)), None)
+        if known is not None:
+            modes[known] = modes[known]._replace(climbs=modes[known].climbs + 1)
+        elif np.isfinite(height) and (mode := _mode_at(density, data, z, height)) is not None:
+            modes = merged([*modes, mode])
     return modes
 
 
