@@ -188,7 +188,7 @@ def test_a_posterior_is_refused_after_its_grips_were_edited(gripped, capsys):
         "--data",
         "test.csv",
         "--noise",
-        "stress_x=0.1",
+        "stress=0.1",
         "--forward",
         "incompressible",
         "--no-certify",
