@@ -1,4 +1,4 @@
-"""What inferred noise has taken up: the misfit of a law looks like noise of a large sd."""
+"""Inferred noise beside the scatter of the data: the misfit of a law looks like noise."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class TakenUp:
 
     @property
     def is_misfit(self) -> bool:
-        """Whether the noise is large, and most of it is no scatter."""
+        """True where the noise is large and exceeds the scatter of neighbouring data."""
         large = self.sd > LARGEST_SHARE * self.signal or self.sd > _OVER_PRIOR * self.prior
         return large and self.sd > _OVER_SCATTER * self.scatter
 

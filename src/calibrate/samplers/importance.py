@@ -180,7 +180,7 @@ class _Run:
         if not np.isfinite(self.points.log_weights).any():
             raise SolverError("the posterior density is zero at every draw of the prior")
         self.modes: list[Mode] = []
-        # Of climbs: half of all are draws of the prior, where each mode still has its basin.
+        # Half of all climbs start at draws of the prior, where each mode still has its basin.
         self._starts = [z[self._rng.choice(len(z), size=MOST)]]
 
     def search(self) -> None:
@@ -191,7 +191,8 @@ class _Run:
             if weights.any():
                 self._starts.append(z[self._rng.choice(len(z), size=MOST, p=weights)])
                 if step == _PATIENCE:
-                    looked = self._look()
+                    self._look()
+                    looked = True
             self._go_to(z, weights, _CHOSEN, _NARROW, self._step, _ON_THE_WAY)
             if (worth := effective_number(self.points.log_weights)) >= _FOUND:
                 break
@@ -204,14 +205,13 @@ class _Run:
             self._look()
         self.settle()
 
-    def _look(self) -> bool:
+    def _look(self) -> None:
         """Find modes by climbs from draws of the prior and from points of the steps, in turn."""
         prior, *steps = self._starts
         of_steps = np.stack(steps, axis=1).reshape(-1, self._density.dimension)[:MOST]
         starts = np.stack([prior, of_steps], axis=1).reshape(-1, self._density.dimension)[:MOST]
         with _ONE_CLIMBS:
             self.modes = explore(self._density, self._data, starts, self._starts[-1])
-        return True
 
     def settle(self) -> None:
         """Fit the proposal to the points until their weights have a light tail."""

@@ -86,13 +86,8 @@ def white_at_mode(
     starts : points (m, p) from which the optimiser starts.
     """
     modes = find_modes(density, data, starts)
-    if not len(modes.z):
-        return None
-    precision, smallest, distance = curvature(density, data, modes.z[0])
-    if not (smallest > 0.0 and distance < _AWAY):
-        return None
-    factor = np.linalg.cholesky(precision)
-    return modes.z[0], coloured(np.eye(len(factor)), factor).T
+    highest = _mode_at(density, data, modes.z[0], modes.heights[0]) if len(modes.z) else None
+    return None if highest is None else (highest.z, highest.root)
 
 
 class Modes(NamedTuple):
@@ -125,7 +120,7 @@ def _climber(
     A climb that comes to one of the modes ``known`` ends there.
     """
     programs = programs_of(density)
-    # From white coordinates w to z = factor w.
+    # The climb is in white coordinates w, with z = factor w.
     factor = np.eye(density.dimension)
     if draws is not None and (covariance := _covariance(draws)) is not None:
         factor = np.linalg.cholesky(covariance)

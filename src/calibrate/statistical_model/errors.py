@@ -40,7 +40,7 @@ from calibrate.noise.protocol import independent_information, information_about_
 from calibrate.statistical_model.fem_likelihood import FEMLikelihood
 from calibrate.statistical_model.finer_fem import finer_fem
 from calibrate.statistical_model.model import Model
-from calibrate.statistical_model.moves import Answer, largest_move
+from calibrate.statistical_model.moves import FEMAnswer, largest_move
 from calibrate.statistical_model.predictive import Predictive, noise_sds
 from emulator.accuracy.estimate import newton_distance
 from emulator.accuracy.mesh_error import MeshErrorEstimate
@@ -210,7 +210,7 @@ def with_error(
 
 
 class MapErrors(NamedTuple):
-    """What the error of a forward map does to a posterior.
+    """Sizes of a forward map's error, and the moves of posterior means that follow.
 
     sizes : the error of the data at draws in noise sd, as of :func:`in_noise_sd`, by the
         observation's name.
@@ -258,7 +258,7 @@ def map_errors(
         solution = simulator.solve(theta, u)
         return solution.displacement if solution.converged else jnp.full_like(u, jnp.nan)
 
-    def answer(z: np.ndarray, equilibrium: Callable[..., jax.Array]) -> Answer | None:
+    def answer(z: np.ndarray, equilibrium: Callable[..., jax.Array]) -> FEMAnswer | None:
         """Return FEM's answer at z (p,); None where there is none."""
         draw = {name: values[0] for name, values in predictive.constrain(z[None]).items()}
         thetas = model.states.thetas(draw)
@@ -268,9 +268,9 @@ def map_errors(
         if not np.isfinite(error).all():
             return None
         height = float(model.fem_log_likelihood(draw, exact, data))
-        return Answer(z, error, height) if np.isfinite(height) else None
+        return FEMAnswer(z, error, height) if np.isfinite(height) else None
 
-    def ask(points: np.ndarray, runs: int) -> tuple[list[Answer], bool]:
+    def ask(points: np.ndarray, runs: int) -> tuple[list[FEMAnswer], bool]:
         """Return the answers at points (k, p), ``runs`` at most by FEM, and whether one failed."""
         steps = [answer(z, by_newton) for z in points]
         refused = [z for z, step in zip(points, steps, strict=True) if step is None]
@@ -289,7 +289,7 @@ def map_errors(
     some = z[np.linspace(0, len(z) - 1, min(_CLOUD, len(z))).astype(int)]
     left = [_FEWEST_ANSWERS]
 
-    def ask_further(points: np.ndarray) -> list[Answer]:
+    def ask_further(points: np.ndarray) -> list[FEMAnswer]:
         found, _ = ask(points, left[0])
         left[0] -= min(left[0], len(points) - len(found))
         return found

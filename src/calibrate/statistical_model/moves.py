@@ -34,7 +34,7 @@ _VARIES = 1e-9  # sd of draws, relative to the largest, below which they do not 
 _FITTED_TO = 15.0  # the same, of points at which a correction has to be good
 
 
-class Answer(NamedTuple):
+class FEMAnswer(NamedTuple):
     """FEM at a point z (p,): its data less the map's, flat (m,), and its log likelihood."""
 
     z: np.ndarray
@@ -45,8 +45,8 @@ class Answer(NamedTuple):
 def largest_move(
     predictive: Predictive,
     z: np.ndarray,
-    answers: Sequence[Answer],
-    ask: Callable[[np.ndarray], list[Answer]],
+    answers: Sequence[FEMAnswer],
+    ask: Callable[[np.ndarray], list[FEMAnswer]],
     count: int,
     rng: np.random.Generator,
 ) -> float:
@@ -60,7 +60,7 @@ def largest_move(
     """
     rows, answers, surprises = len(answers) + _ROUNDS * count, list(answers), list[float]()
     correction = _fitted(predictive, answers, rows)
-    told, fresh = len(answers), list[Answer]()
+    told, fresh = len(answers), list[FEMAnswer]()
     for round_ in ("around", "uphill", "pool"):
         if round_ == "around":
             points = Kernels.surrounding(z, rng).sample(rng, count)
@@ -88,20 +88,20 @@ def largest_move(
     return float(np.max(np.abs(moves[vary]) / draws.std(axis=0)[vary], initial=0.0))
 
 
-def _uphill(predictive: Predictive, answer: Answer) -> np.ndarray:
+def _uphill(predictive: Predictive, answer: FEMAnswer) -> np.ndarray:
     """Return the point (p,) a Gauss-Newton step up FEM's log posterior from an answer's point."""
     means = predictive.means(answer.z[None])[0][0] + answer.error
     _, gradient, curvature = predictive.curvature(answer.z, means, predictive.slopes(answer.z))
     return finite_coordinates(answer.z + np.linalg.solve(curvature, gradient))
 
 
-def _heights(predictive: Predictive, answers: list[Answer]) -> np.ndarray:
+def _heights(predictive: Predictive, answers: list[FEMAnswer]) -> np.ndarray:
     """Return FEM's log posterior density (k,) at the answers' points, up to a constant."""
     prior = predictive.by_map(np.array([answer.z for answer in answers]))[0]
     return np.asarray(prior) + [answer.log_likelihood for answer in answers]
 
 
-def _fitted(predictive: Predictive, answers: list[Answer], rows: int) -> Correction:
+def _fitted(predictive: Predictive, answers: list[FEMAnswer], rows: int) -> Correction:
     """Return the correction that the answers teach, of the shape of one of ``rows`` points."""
     features = predictive.features(np.array([answer.z for answer in answers]))
     errors = np.array([answer.error for answer in answers])

@@ -220,7 +220,7 @@ class Tube:
 def _check_path(inner: np.ndarray, axial: np.ndarray, rows: np.ndarray, name: str) -> None:
     """Refuse a test in which the radius falls while the stretch does not grow."""
     way = inner - inner.min()
-    # Where the stretch has grown, the radius may have shrunk with it.
+    # A tube that is stretched further may shrink: only rows of no larger stretch count.
     back = np.flatnonzero(falls(way) & (axial <= axial[_largest_before(way)]))
     if len(back):
         test = f" of '{name}'" if name else ""
