@@ -34,7 +34,7 @@ from calibrate.project.results import (
     reserved,
 )
 from calibrate.project.run import Run
-from calibrate.samplers.importance import AUTO
+from calibrate.samplers.auto import AUTO
 from calibrate.samplers.nuts import NUTS
 from calibrate.statistical_model import Model
 from emulator.core import schema

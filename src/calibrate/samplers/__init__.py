@@ -4,9 +4,10 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
+from calibrate.samplers.auto import AUTO, AutoOptions
 from calibrate.samplers.chains import ChainSampler
 from calibrate.samplers.diagnostics import r_hat
-from calibrate.samplers.importance import AUTO, IMPORTANCE, AutoOptions, ImportanceOptions
+from calibrate.samplers.importance import IMPORTANCE, ImportanceOptions
 from calibrate.samplers.laplace import LAPLACE, LaplaceOptions
 from calibrate.samplers.nuts import BLACKJAX_NUTS, NUTS, BlackJAXNUTSOptions, NUTSOptions
 from calibrate.samplers.protocol import ChainOptions, Context, Draws, Kernel, Sampler

@@ -34,15 +34,12 @@ al. 2024) shows whether the proposal covers it.
 
 A mode that has no basin to climb from is found by nothing: a spike beside a broad mode, narrower
 than the distance between points of the prior.
-
-The sampler by default, ``auto``, takes these draws where unknowns are few, the forward map is fast
-in batches, populations agree and the tail is light, and those of NUTS elsewhere.
 """
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from threading import Lock
 from typing import Any, ClassVar
 
@@ -71,7 +68,6 @@ from calibrate.samplers.modes import (
     shares,
     unseen,
 )
-from calibrate.samplers.nuts import NUTS, NUTSOptions
 from calibrate.samplers.protocol import Context, Draws, Options, Sampler, in_rounds
 from calibrate.statistical_model import Data
 from calibrate.statistical_model.density import Density, Heights, heights, prior_draws
@@ -414,63 +410,3 @@ class ImportanceSampling(Sampler):
 
 
 IMPORTANCE: Sampler = ImportanceSampling("importance", ImportanceOptions)
-
-MOST_UNKNOWNS = 8
-# Attributes of a run of ``auto``: whose draws they are, and why not those of importance sampling.
-SAMPLED_BY, NOT_BY_IMPORTANCE = "sampled_by", "not_by_importance"
-
-
-@dataclass(frozen=True)
-class AutoOptions(NUTSOptions):
-    """Length of a run, as of NUTS; importance sampling reads its length and limits."""
-
-    label: ClassVar[str] = "auto"
-
-
-class Auto(Sampler):
-    """The sampler that chooses another."""
-
-    def sample(self, density: Density, data: Data, options: AutoOptions, context: Context) -> Draws:
-        """Return the draws of the sampler named by the attribute ``sampled_by``.
-
-        The attribute ``not_by_importance`` says why it is not importance sampling.
-
-        Raises
-        ------
-        SolverError
-            No chain of NUTS could start where the density is finite.
-        """
-        draws = _by_importance(density, data, options, context)
-        if isinstance(draws, Draws):
-            return draws._replace(attributes={SAMPLED_BY: IMPORTANCE.name, **draws.attributes})
-        why = {SAMPLED_BY: NUTS.name, NOT_BY_IMPORTANCE: draws}
-        draws = NUTS.sample(density, data, _for(NUTS, options), context)
-        return draws._replace(attributes={**why, **draws.attributes})
-
-
-def _by_importance(
-    density: Density, data: Data, options: AutoOptions, context: Context
-) -> Draws | str:
-    """Return the draws of importance sampling, or why they are not to be used."""
-    if density.dimension > MOST_UNKNOWNS:
-        return f"{density.dimension} unknowns; up to {MOST_UNKNOWNS} are few"
-    if not density.batches:
-        return "the forward map solves FEM"
-    try:
-        draws = IMPORTANCE.sample(density, data, _for(IMPORTANCE, options), context)
-    except SolverError as error:
-        return str(error)
-    if not (shape := draws.attributes["weights_pareto_k"]) <= LARGEST_PARETO_SHAPE:
-        return f"the weights' tail is heavy, Pareto k {shape:.2f}"
-    if not converged(draws.z, options.r_hat, options.ess):
-        return "independent populations disagree"
-    return draws
-
-
-def _for(sampler: Sampler, options: AutoOptions) -> Any:
-    """Return the options of a sampler that ``options`` has, too; its own defaults for others."""
-    names = {field.name for field in fields(sampler.options)} & {f.name for f in fields(options)}
-    return sampler.options(**{name: getattr(options, name) for name in names})
-
-
-AUTO: Sampler = Auto("auto", AutoOptions)

@@ -13,13 +13,8 @@ from calibrate.importance.proposals import Kernels, effective_number, resampled,
 from calibrate.importance.weights import normalised
 from calibrate.posterior.diagnosis import diagnose
 from calibrate.samplers import Density, ImportanceOptions, density_of, find_sampler
-from calibrate.samplers.importance import (
-    AUTO,
-    IMPORTANCE,
-    NOT_BY_IMPORTANCE,
-    SAMPLED_BY,
-    AutoOptions,
-)
+from calibrate.samplers.auto import AUTO, NOT_BY_IMPORTANCE, SAMPLED_BY, AutoOptions
+from calibrate.samplers.importance import IMPORTANCE
 from calibrate.samplers.protocol import Context
 from emulator.core.errors import InputError, SolverError
 from emulator.surrogates.fem import fem_forward
@@ -199,7 +194,7 @@ def test_nuts_is_taken_where_importance_sampling_does_not_work(beam, simulator, 
 
     assert attributes_of(model)[SAMPLED_BY] == "importance"
     asked = []
-    monkeypatch.setattr("calibrate.samplers.importance.IMPORTANCE", Refusing(asked))
+    monkeypatch.setattr("calibrate.samplers.auto.IMPORTANCE", Refusing(asked))
     attributes = attributes_of(model)
     assert attributes[SAMPLED_BY] == "nuts"
     assert attributes[NOT_BY_IMPORTANCE] == "importance: refused"
