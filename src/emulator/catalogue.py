@@ -12,12 +12,18 @@ from emulator.scenes.built_in import BUILT_IN
 from emulator.scenes.file import read_scene
 from emulator.scenes.finer import CHANGES, FINER, Finer, finer
 from emulator.scenes.scene import Scene
+from emulator.scenes.specimen import Specimen, with_mesh
 
 _RELEASED = "published:"
 
 
 def find_scene(name: str, root: str | Path | None = None) -> Scene:
-    """Return the scene called ``name``.
+    """Return the scene called ``name``, as :func:`find_problem`; a specimen is refused."""
+    return with_mesh(find_problem(name, root))
+
+
+def find_problem(name: str, root: str | Path | None = None) -> Scene | Specimen:
+    """Return the scene or the specimen called ``name``.
 
     Parameters
     ----------
@@ -33,7 +39,7 @@ def find_scene(name: str, root: str | Path | None = None) -> Scene:
     """
     word, _, of = name.partition(":")
     if of and word in CHANGES:
-        return CHANGES[word](find_scene(of, root))
+        return CHANGES[word](find_problem(of, root))
     if name.startswith(_RELEASED):
         if root is None:
             raise InputError(f"scene '{name}': say where the published data is with --root DIR")
@@ -54,9 +60,9 @@ def scene_from_origin(origin: Mapping[str, Any]) -> Scene:
     options = dict(origin)
     name = options.pop("scene", None)
     if name in CHANGES:
-        return CHANGES[name](scene_from_origin(options["of"]))
+        return with_mesh(CHANGES[name](scene_from_origin(options["of"])))
     if name == "file":
-        return read_scene(options["path"])
+        return with_mesh(read_scene(options["path"]))
     if isinstance(name, str) and name.startswith(_RELEASED):
         return find_scene(name, options["root"])
     if name not in BUILT_IN:

@@ -109,7 +109,7 @@ def of_row(size: float, number: int, runs: int) -> Case:
     theta = sobol(gripped(size).specimen, 64, SEED)[number]
     data = twin(size, theta, number)
     plain = sampled(gripped(size).specimen, data)
-    certificate = cal.certify(plain, em.Simulator(gripped(size).specimen), seed=SEED)
+    certificate = cal.certify(plain, em.homogeneous(gripped(size).specimen), seed=SEED)
     true = sampled(scene_of(size, learned(size, runs)), data)
     (mean, sd), (gripped_mean, _) = in_units(plain), in_units(true)
     row = certificate.evidence.mesh

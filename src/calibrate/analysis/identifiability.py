@@ -52,7 +52,7 @@ from calibrate.statistical_model import Model
 from emulator.core.errors import InputError, look_up
 from emulator.core.minimise import minimise
 from emulator.fem.energy import point_energy
-from emulator.scenes.scene import Scene
+from emulator.scenes.forward_problem import ForwardProblem
 from emulator.scenes.tissue import Tissue, stiffness_of
 
 _PRIOR_DRAWS = 4096
@@ -312,7 +312,9 @@ def stress_band(
     return StressBand(direction, stretch, *quantiles)
 
 
-def stresses(scene: Scene, theta: jax.Array, axis: jax.Array, stretch: np.ndarray) -> jax.Array:
+def stresses(
+    scene: ForwardProblem, theta: jax.Array, axis: jax.Array, stretch: np.ndarray
+) -> jax.Array:
     """Return stress differences (n,), kPa, along ``axis`` (3,); fibres along x, sheets along y."""
     energy, at = point_energy(scene, theta), _tissue(scene, theta)
 
@@ -325,7 +327,7 @@ def stresses(scene: Scene, theta: jax.Array, axis: jax.Array, stretch: np.ndarra
     return lam * jax.vmap(jax.grad(along))(lam)
 
 
-def _tissue(scene: Scene, theta: jax.Array) -> Tissue:
+def _tissue(scene: ForwardProblem, theta: jax.Array) -> Tissue:
     """Return the tissue of the first region, the fibre along x and the sheet along y."""
     directions = None
     if scene.law.sheets:

@@ -50,7 +50,7 @@ from calibrate.statistical_model.predictive import Predictive
 from emulator.core.display import Stages, counting
 from emulator.core.errors import InputError, check_arguments
 from emulator.core.machine import one_blas_thread
-from emulator.fem import Simulator
+from emulator.fem.solution import EquilibriumSolver
 
 _BEGIN, _AT_MOST = 70, 200  # FEM runs by default
 _FEWEST = 25
@@ -86,7 +86,7 @@ class Check:
 
 def examine(
     posterior: Posterior,
-    simulator: Simulator,
+    simulator: EquilibriumSolver,
     *,
     draws: int | None = None,
     at_most: int | None = None,
@@ -153,7 +153,7 @@ def examine(
     return Check(judge(replace(evidence, mesh=change)), posterior, tests)
 
 
-def certify(posterior: Posterior, simulator: Simulator, **options: Any) -> Certificate:
+def certify(posterior: Posterior, simulator: EquilibriumSolver, **options: Any) -> Certificate:
     """Return the certificate of :func:`examine`: ``posterior`` against FEM.
 
     ``options`` are those of :func:`examine`.
@@ -220,7 +220,7 @@ def _further_runs(total: int, most: int) -> int:
 
 
 def reweight(
-    posterior: Posterior, simulator: Simulator, *, seed: int = 0, **options: Any
+    posterior: Posterior, simulator: EquilibriumSolver, *, seed: int = 0, **options: Any
 ) -> Posterior:
     """Return FEM's posterior in place of ``posterior``, checked as by :func:`examine`.
 

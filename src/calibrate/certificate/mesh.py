@@ -45,7 +45,10 @@ from emulator.core.display import counting
 from emulator.core.errors import InputError, SolverError
 from emulator.fem import Simulator
 from emulator.fem.campaign import in_order
-from emulator.scenes.specimen import is_specimen
+from emulator.fem.solution import EquilibriumSolver
+from emulator.scenes.scene import Scene
+from emulator.scenes.specimen import Specimen
+from emulator.surrogates.homogeneous import Homogeneous
 
 MOST_RUNS = 30
 """Default of the largest number of solves on the finer mesh."""
@@ -77,7 +80,7 @@ def points_for(unknowns: int, states: int, most: int | None) -> tuple[int, int]:
 
 def mesh_change(
     pool: Pool,
-    simulator: Simulator,
+    simulator: EquilibriumSolver,
     runs: Runs,
     count: int | None,
     rng: np.random.Generator,
@@ -95,10 +98,10 @@ def mesh_change(
     predictive = pool.predictive
     if count == 0:
         return MeshChange(why="not asked")
-    if not isinstance(simulator, Simulator):
+    if not isinstance(simulator, Simulator | Homogeneous):
         return MeshChange(why="the simulator is not FEM's")
     scene = simulator.scene
-    if is_specimen(scene) and scene.grips is None and scene.tube is None:
+    if isinstance(scene, Specimen) and scene.grips is None and scene.tube is None:
         said = SAID_HOMOGENEOUS if scene.homogeneous else NOBODY_SAID
         return MeshChange(why="its states are homogeneous on any mesh", homogeneous=said)
     try:
@@ -123,8 +126,8 @@ def mesh_change(
         runs=change.runs * states,
         failed=change.failed * states,
         nodes=finer.nodes,
-        linear=simulator.scene.mesh.order == 1,
-        gripped=simulator.scene.grips is not None,
+        linear=isinstance(scene, Scene) and scene.mesh.order == 1,
+        gripped=isinstance(scene, Specimen),
     )
 
 

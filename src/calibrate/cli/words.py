@@ -15,7 +15,9 @@ from emulator.core.store import check_folder
 if TYPE_CHECKING:
     import jax
 
+    from emulator.scenes.forward_problem import ForwardProblem
     from emulator.scenes.scene import Scene
+    from emulator.scenes.specimen import Specimen
 
 
 class _Once(Action):
@@ -166,19 +168,26 @@ def scene_words(arguments: Namespace) -> tuple[str, str | None]:
     return arguments.scene, arguments.root
 
 
+def problem_of(arguments: Namespace) -> Scene | Specimen:
+    """Return the scene or the specimen that :func:`add_scene` read."""
+    from emulator.catalogue import find_problem
+
+    return find_problem(*scene_words(arguments))
+
+
 def scene_of(arguments: Namespace) -> Scene:
-    """Return the scene that :func:`add_scene` read."""
-    from emulator.catalogue import find_scene
+    """Return the scene that :func:`add_scene` read; :class:`InputError` for a specimen."""
+    from emulator.scenes.specimen import with_mesh
 
-    return find_scene(*scene_words(arguments))
+    return with_mesh(problem_of(arguments))
 
 
-def theta_of(arguments: Namespace, scene: Scene) -> jax.Array:
+def theta_of(arguments: Namespace, scene: ForwardProblem) -> jax.Array:
     """Return the theta (p,) of :data:`THETA`, inside the scene's box."""
     return scene.theta(**assignments(arguments.theta)) if arguments.theta else scene.centre
 
 
-def theta_by_name(scene: Scene, theta: Any) -> dict[str, float]:
+def theta_by_name(scene: ForwardProblem, theta: Any) -> dict[str, float]:
     """Return a theta (p,) as a result has it."""
     return dict(zip(scene.parameter_names, map(float, theta), strict=True))
 

@@ -11,6 +11,7 @@ from calibrate.figures import draw_body, panels, pyplot, save
 from emulator.accuracy.comparison import UNITS, Errors, log_density, quantiles
 from emulator.geometry.facets import flat_triangles
 from emulator.geometry.mesh import Mesh
+from emulator.scenes.specimen import with_mesh
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,7 +32,7 @@ _COLOUR = "tab:blue"
 
 def draw(evaluated: Evaluated, folder: str | Path) -> list[Path]:
     """Draw all figures into ``folder``, and return the files."""
-    scene, folder = evaluated.forward.scene, Path(folder)
+    scene, folder = with_mesh(evaluated.forward.scene), Path(folder)
     title = f"{scene.name}: {evaluated.forward.label} against {evaluated.report['reference']}"
     figures = {
         "error_densities.png": density_figure(evaluated.errors, title),

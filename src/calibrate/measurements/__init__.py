@@ -48,7 +48,8 @@ from calibrate.measurements.tube import TubeForce, TubePressure
 from calibrate.measurements.volume import CavityVolume
 from calibrate.state_names import in_state, split
 from emulator.core.errors import InputError, look_up
-from emulator.scenes.scene import Scene
+from emulator.scenes.forward_problem import ForwardProblem
+from emulator.scenes.specimen import with_mesh
 
 # Kinds are tried in this order on a file's columns: `node` comes before `x,y,z`.
 OBSERVATIONS: dict[str, type[Observation]] = {
@@ -110,7 +111,7 @@ __all__ = [
 
 
 def parse_observation(
-    scene: Scene, text: str, seed: int = 0, states: Sequence[str] = ("",)
+    scene: ForwardProblem, text: str, seed: int = 0, states: Sequence[str] = ("",)
 ) -> Observations:
     """Return what the words joined by ``+`` ask for, e.g. ``landmarks:24+volume``.
 
@@ -132,20 +133,20 @@ def parse_observation(
     return Observations(parts)
 
 
-def _parse_word(scene: Scene, word: str, seed: int) -> tuple[str, Observation]:
+def _parse_word(scene: ForwardProblem, word: str, seed: int) -> tuple[str, Observation]:
     """Return name and observation; a word's part before the colon is its kind, else it is nodes."""
     if kind := OBSERVATIONS.get(word.partition(":")[0]):
         return kind.parse(scene, word, seed)
-    if nodes := nodes_called(scene, word):
+    if nodes := nodes_called(with_mesh(scene), word):
         return DISPLACEMENT, nodes
     raise InputError(
         f"observe '{word}': give {', '.join(kind.usage for kind in OBSERVATIONS.values())}; "
-        f"node sets: {', '.join(sorted(scene.mesh.node_sets)) or 'none here'}"
+        f"node sets: {', '.join(sorted(with_mesh(scene).mesh.node_sets)) or 'none here'}"
     )
 
 
 def observations_from_json(
-    scene: Scene, description: Mapping[str, Mapping[str, Any]]
+    scene: ForwardProblem, description: Mapping[str, Mapping[str, Any]]
 ) -> Observations:
     """Return what :meth:`Observations.to_json` described."""
 

@@ -43,7 +43,7 @@ from calibrate.measurements.tables import (
 from calibrate.state_names import in_state, split
 from emulator.core.cells import SPREADSHEETS, TEXT
 from emulator.core.errors import InputError
-from emulator.scenes.scene import Scene
+from emulator.scenes.forward_problem import ForwardProblem
 
 _OTHER_SPREADSHEETS = (".xls", ".ods")
 
@@ -55,7 +55,7 @@ Files = str | Path | Mapping[str, str]
 
 
 def read_measurements(
-    scene: Scene, files: Files
+    scene: ForwardProblem, files: Files
 ) -> tuple[Observations, dict[str, np.ndarray], dict[str, float]]:
     """Return the observations of a file, their data by the same names, and known parameters.
 
@@ -90,7 +90,7 @@ def read_measurements(
 
 
 def _observed(
-    scene: Scene, file: DataTable, state: str
+    scene: ForwardProblem, file: DataTable, state: str
 ) -> dict[str, tuple[Observation, np.ndarray]]:
     """Return the observations of one load state and their data, by name."""
     tables, found = _tables(file), {}

@@ -41,13 +41,13 @@ def spread_nodes(scene: Scene, count: int, seed: int) -> np.ndarray:
 
 def spread_landmarks(scene: Scene, count: int, seed: int) -> np.ndarray:
     """Return ``count`` points (count, 3) mm, uniform over the volume of the reference body."""
-    rng = np.random.default_rng(seed)
+    mesh, rng = scene.mesh, np.random.default_rng(seed)
     volumes = scene.discretisation.weights.sum(axis=1)
     elements = rng.choice(len(volumes), count, p=volumes / volumes.sum())
     # Uniform in the reference element: uniform in an element with straight edges.
     barycentric = rng.dirichlet(np.ones(4), count)
-    weights, _ = shapes_at(scene.mesh.order, barycentric)
-    return np.einsum("da,dai->di", weights, scene.mesh.nodes[scene.mesh.elements[elements]])
+    weights, _ = shapes_at(mesh.order, barycentric)
+    return np.einsum("da,dai->di", weights, mesh.nodes[mesh.elements[elements]])
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,6 @@ from scipy.sparse import csr_array
 from calibrate.noise.gaussian import GaussianNoise
 from calibrate.noise.protocol import Sites
 from emulator.core.errors import InputError
-from emulator.scenes.scene import Scene
 from emulator.surrogates.protocol import ForwardMap
 
 LARGEST_SHARE = 0.03
@@ -119,7 +118,7 @@ class Observation(ABC):
         """
 
     @classmethod
-    def of(cls, scene: Scene, *arguments: Any, **options: Any) -> Self:
+    def of(cls, scene: Any, *arguments: Any, **options: Any) -> Self:
         """Return the observation of ``scene`` that the arguments describe, as text or arrays."""
         return cls(scene, *arguments)  # type: ignore[call-arg]
 
@@ -166,7 +165,7 @@ class Observation(ABC):
         return {}, {}, {}
 
     @classmethod
-    def parse(cls, scene: Scene, word: str, seed: int) -> tuple[str, Self]:
+    def parse(cls, scene: Any, word: str, seed: int) -> tuple[str, Self]:
         """Return the name and the observation that ``word`` of the command line asks for.
 
         The word begins with the kind. Random places are drawn from ``seed``.
@@ -192,7 +191,7 @@ class Observation(ABC):
         return {"kind": self.kind, "word": self.names[-1]}
 
     @classmethod
-    def from_json(cls, scene: Scene, description: Mapping[str, Any]) -> Self:
+    def from_json(cls, scene: Any, description: Mapping[str, Any]) -> Self:
         """Return the observation that :meth:`to_json` described."""
         return cls.parse(scene, description["word"], 0)[1]
 
@@ -207,7 +206,7 @@ class Observation(ABC):
 
     @classmethod
     def read(
-        cls, scene: Scene, name: str, table: Table, arrays: Mapping[str, np.ndarray]
+        cls, scene: Any, name: str, table: Table, arrays: Mapping[str, np.ndarray]
     ) -> tuple[Self, np.ndarray]:
         """Return the observation called ``name`` and its data, from the arrays of its table."""
         _, part = cls.parse(scene, name, 0)
@@ -278,11 +277,11 @@ class Observation(ABC):
             raise InputError(f"{name} has no usual noise; give --noise {name}=SD, in {self.unit}")
         return GaussianNoise(sd=self.usual_sd)
 
-    def size_in(self, scene: Scene) -> float | None:
+    def size_in(self, scene: Any) -> float | None:
         """Return the size of what is observed of the body at rest, in the data's unit, if any."""
         return scene.mesh.size if self.unit == "mm" else None
 
-    def noise_in(self, scene: Scene) -> GaussianNoise:
+    def noise_in(self, scene: Any) -> GaussianNoise:
         """Return :attr:`default_noise`, no larger than a share of what is observed in ``scene``."""
         noise, size = self.default_noise, self.size_in(scene)
         largest = np.inf if size is None else LARGEST_SHARE * size

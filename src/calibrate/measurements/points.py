@@ -22,7 +22,6 @@ from calibrate.measurements.observation import (
 )
 from calibrate.noise.protocol import Sites
 from emulator.core.errors import InputError
-from emulator.scenes.scene import Scene
 
 XYZ = ("x", "y", "z")
 DISPLACEMENT = "displacement"
@@ -61,7 +60,7 @@ class PointObservation(Observation):
 
     @classmethod
     def located(
-        cls, scene: Scene, selection: tuple[Any, ...], places: np.ndarray, values: np.ndarray
+        cls, scene: Any, selection: tuple[Any, ...], places: np.ndarray, values: np.ndarray
     ) -> Self:
         """Return the observation at the places of a file; ``values`` (d, c) are for errors."""
         return cls.of(scene, *selection, places)
@@ -114,7 +113,7 @@ class PointObservation(Observation):
         return Sites(*(of[kept] for of in Sites.of(self.points, max(len(self.components), 1))))
 
     @classmethod
-    def parse(cls, scene: Scene, word: str, seed: int) -> tuple[str, Self]:
+    def parse(cls, scene: Any, word: str, seed: int) -> tuple[str, Self]:
         """Read ``kind:N`` or ``kind:selection:N``: N places drawn at random.
 
         A kind that has all its places by itself is ``kind:selection``.
@@ -143,7 +142,7 @@ class PointObservation(Observation):
         return {"kind": self.kind, **plain, **gaps}
 
     @classmethod
-    def from_json(cls, scene: Scene, description: Mapping[str, Any]) -> Self:
+    def from_json(cls, scene: Any, description: Mapping[str, Any]) -> Self:
         """Return the observation with these arguments and entries."""
         arguments = [description[argument] for argument in cls.arguments]
         places = [np.asarray(each) for each in arguments[-1:]]
@@ -158,7 +157,7 @@ class PointObservation(Observation):
 
     @classmethod
     def read(
-        cls, scene: Scene, name: str, table: Table, arrays: Mapping[str, np.ndarray]
+        cls, scene: Any, name: str, table: Table, arrays: Mapping[str, np.ndarray]
     ) -> tuple[Self, np.ndarray]:
         """Return the observation and its data, from places and values.
 

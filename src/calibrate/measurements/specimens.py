@@ -16,8 +16,8 @@ from calibrate.measurements.observation import Block, Field
 from calibrate.measurements.points import PointObservation
 from calibrate.noise.protocol import Sites
 from emulator.core.errors import InputError
-from emulator.scenes.scene import Scene, all_nodes
-from emulator.scenes.specimen import measured_states, states_in
+from emulator.scenes.scene import all_nodes
+from emulator.scenes.specimen import Specimen, require_specimen, states_in
 from emulator.scenes.states import APPLIED, AXES, States
 
 _APART = 1e3  # distance between the sites of two tests, whose errors do not correlate
@@ -30,10 +30,10 @@ class SpecimenCurves(PointObservation):
 
     A kind computes them from all nodes in ``_measured``, and gives its columns.
 
-    scene : the specimen; :class:`InputError` for another scene.
+    scene : the specimen; :class:`InputError` for a scene.
     """
 
-    scene: Scene
+    scene: Specimen
 
     place_field = Field("motion", ("stretch_x",), where=True)
     constants = {"stretch": "stretches"}
@@ -45,17 +45,17 @@ class SpecimenCurves(PointObservation):
     """Way along a curve over which errors correlate in a first experiment file, and its unit."""
 
     def __post_init__(self) -> None:
-        measured_states(self.scene)  # refuses what is no specimen
+        require_specimen(self.scene)
         self._derive(nodes=all_nodes(self.scene))
 
     @abstractmethod
     def _measured(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the numbers (d, c) at the displacement (n, 3) mm of all nodes."""
 
-    @cached_property
+    @property
     def states(self) -> States:
         """The measured states."""
-        return measured_states(self.scene)
+        return self.scene.measured
 
     @property
     def _full_shape(self) -> tuple[int, ...]:
@@ -185,7 +185,7 @@ class Components(SpecimenCurves):
                 raise InputError(f"{self.quantity} '{component}' is unknown; {self.such_as}")
 
     @classmethod
-    def of(cls, scene: Scene, components: str | Sequence[str]) -> Self:
+    def of(cls, scene: Specimen, components: str | Sequence[str]) -> Self:
         """Return the observation of ``components``, as text joined by commas."""
         texts = components.split(",") if isinstance(components, str) else components
         return cls(scene, tuple(str(text) for text in texts))  # type: ignore[call-arg]

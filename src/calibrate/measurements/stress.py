@@ -37,7 +37,7 @@ from calibrate.measurements.specimens import Components
 from emulator.core.errors import InputError
 from emulator.core.units import IN_KPA, IN_MM2, IN_MN, factor, other_units
 from emulator.mechanics.kinematics import cofactor, determinant
-from emulator.scenes.scene import Scene
+from emulator.scenes.specimen import Specimen
 from emulator.scenes.states import (
     AXES,
     components_of,
@@ -64,7 +64,7 @@ class Stress(Components):
     shares : what grips add, (d, 3, 3), in place of what the scene's grips have learned.
     """
 
-    scene: Scene
+    scene: Specimen
     components: tuple[str, ...]
     shares: jax.Array | None = None
 
@@ -129,7 +129,7 @@ class Stress(Components):
 
     @classmethod
     def read(
-        cls, scene: Scene, name: str, table: Table, arrays: Mapping[str, np.ndarray]
+        cls, scene: Specimen, name: str, table: Table, arrays: Mapping[str, np.ndarray]
     ) -> tuple[Self, np.ndarray]:
         """Return the observation and its data in kPa, of the states that the scene has."""
         columns = _in_kpa(arrays)

@@ -20,7 +20,7 @@ import numpy as np
 
 from calibrate.measurements.observation import Block, Field, Table
 from calibrate.measurements.specimens import Components
-from emulator.scenes.scene import Scene
+from emulator.scenes.specimen import Specimen
 from emulator.scenes.states import (
     APPLIED,
     AXES,
@@ -41,7 +41,7 @@ class Stretch(Components):
     components : such as ``stretch_x``.
     """
 
-    scene: Scene
+    scene: Specimen
     components: tuple[str, ...]
 
     kind = "stretches"
@@ -64,10 +64,8 @@ class Stretch(Components):
         return [AXES.index(component[-1]) for component in self.components]
 
     def _measured(self, u: jax.Array, theta: jax.Array) -> jax.Array:
-        corners = self.scene.mesh.elements
-        own = [1.0 + u[corners[:, 1 + k], k] - u[corners[:, 0], k] for k in self._axes]
-        # Half a turn of a piece that is pulled along one axis is an equilibrium, too, of FEM's.
-        return jnp.abs(jnp.stack(own, axis=1))
+        diagonal = jnp.diagonal(self.scene.gradients(u), axis1=1, axis2=2)
+        return 1.0 + diagonal[:, np.array(self._axes)]
 
     @classmethod
     def tables(cls, words: Collection[str]) -> dict[str, Table]:
@@ -79,7 +77,7 @@ class Stretch(Components):
 
     @classmethod
     def read(
-        cls, scene: Scene, name: str, table: Table, arrays: Mapping[str, np.ndarray]
+        cls, scene: Specimen, name: str, table: Table, arrays: Mapping[str, np.ndarray]
     ) -> tuple[Self, np.ndarray]:
         """Return the observation and its data, NaN where the stretch is prescribed."""
         axes = sorted(pull_columns(arrays).keys() & stretch_columns(arrays).keys())

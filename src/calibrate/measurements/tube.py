@@ -20,7 +20,7 @@ from calibrate.measurements.specimens import SpecimenCurves
 from emulator.core.errors import InputError
 from emulator.core.units import IN_KPA, IN_MN, factor, other_units
 from emulator.mechanics.kinematics import determinant
-from emulator.scenes.scene import Scene
+from emulator.scenes.specimen import Specimen
 from emulator.scenes.states import with_unit
 from emulator.scenes.tube import Tube, motion_columns
 from emulator.surrogates.homogeneous import homogeneous_stresses
@@ -34,7 +34,7 @@ class OfTube(SpecimenCurves):
     tube over its wall.
     """
 
-    scene: Scene
+    scene: Specimen
 
     column: ClassVar[str]
     units: ClassVar[Mapping[str, float]]
@@ -68,7 +68,7 @@ class OfTube(SpecimenCurves):
 
     @classmethod
     def read(
-        cls, scene: Scene, name: str, table: Table, arrays: Mapping[str, np.ndarray]
+        cls, scene: Specimen, name: str, table: Table, arrays: Mapping[str, np.ndarray]
     ) -> tuple[Self, np.ndarray]:
         """Return the observation and its data, of the states that the scene has."""
         *_, measured = table.fields

@@ -89,8 +89,7 @@ class PressureVolume(NamedTuple):
 def pressure_volume(forward: ForwardMap) -> PressureVolume | None:
     """Return the curve of the first cavity whose pressure is a parameter; None without any."""
     scene = forward.scene
-    inflated = inflated_cavity(scene)
-    if inflated is None:
+    if not isinstance(scene, Scene) or (inflated := inflated_cavity(scene)) is None:
         return None
     volume, column = CavityVolume(scene, inflated[0]), scene.parameter_names.index(inflated[1])
     parameter = scene.parameters[column]

@@ -95,7 +95,7 @@ class Posterior(TableRepr):
             mesh, or a draw at which the forward map has no answer.
         """
         scene, thetas = self.model.forward.scene, self.thetas(state)
-        if np.max(observe.nodes, initial=0) >= len(scene.mesh.nodes):
+        if np.max(observe.nodes, initial=0) >= scene.node_count:
             raise InputError(f"prediction: the observation is not of scene '{scene.name}'")
         for name, value in known.items():
             if name not in scene.parameter_names:

@@ -25,7 +25,7 @@ import numpy as np
 from calibrate.priors.priors import Dependence, JointPrior, log_normal, truncated
 from emulator.core import schema
 from emulator.core.errors import InputError
-from emulator.scenes.scene import Scene
+from emulator.scenes.forward_problem import ForwardProblem
 
 BOX = "box"
 """The name of the prior that is uniform over a scene's range, on its scales."""
@@ -73,7 +73,7 @@ class Population:
             matrix[i, j] = matrix[j, i] = value
         return Dependence(names, matrix)
 
-    def prior(self, scene: Scene) -> JointPrior:
+    def prior(self, scene: ForwardProblem) -> JointPrior:
         """Return the population as the prior of ``scene``, cut to its range.
 
         :class:`InputError` for a parameter that the scene does not have, or that lies outside its
@@ -141,7 +141,7 @@ diagonal, -0.0612, 0.102 and -0.141 beside it, of the factors of a, a_f and b_f 
 POPULATIONS = {"ventricles": VENTRICLES}
 
 
-def prior_of(description: str | Mapping[str, Any], scene: Scene) -> JointPrior | None:
+def prior_of(description: str | Mapping[str, Any], scene: ForwardProblem) -> JointPrior | None:
     """Return the prior of a run: that of a population by name or numbers; ``None`` for ``box``.
 
     :class:`InputError` for an unknown name, or a population that does not fit the scene.

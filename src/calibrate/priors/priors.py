@@ -31,7 +31,7 @@ from numpyro.distributions import constraints
 
 from calibrate.state_names import split
 from emulator.core.errors import InputError
-from emulator.scenes.scene import Scene
+from emulator.scenes.forward_problem import ForwardProblem
 
 Prior = Mapping[str, dist.Distribution]
 
@@ -40,7 +40,7 @@ _BISECTIONS = 80  # halves an interval until double precision ends
 _EDGE = 1e-15  # mass beyond which scores end, at 7.9 sd: the ends of a range have infinite ones
 
 
-def box_prior(scene: Scene) -> dict[str, dist.Distribution]:
+def box_prior(scene: ForwardProblem) -> dict[str, dist.Distribution]:
     """Return uniform priors over the parameters' ranges, log-uniform where the scale is ``log``."""
     return {
         p.name: dist.LogUniform(p.low, p.high) if p.scale == "log" else dist.Uniform(p.low, p.high)
@@ -83,7 +83,7 @@ def log_normal(
     return _cut(whole, low, min(high, median * math.exp(9.0 * log_sd)))
 
 
-def truncated(prior: Prior, scene: Scene) -> Prior:
+def truncated(prior: Prior, scene: ForwardProblem) -> Prior:
     """Return ``prior`` with each distribution cut to the parameter's range in ``scene``.
 
     A posterior under it speaks about the range only: a parameter that piles up at an end of it is

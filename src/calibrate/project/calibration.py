@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -30,6 +30,7 @@ from calibrate.statistical_model.errors import NOT_ASKED, map_errors
 from emulator.core.display import Stages
 from emulator.core.errors import InputError
 from emulator.core.store import write_json
+from emulator.fem import Simulator
 from emulator.surrogates.fem import FEMForward
 from emulator.surrogates.homogeneous import Homogeneous
 
@@ -88,9 +89,8 @@ def infer(
         # The states of a specimen are solved, not learned.
         if check_map and not isinstance(model.full, FEMForward | Homogeneous):
             with stages("check of the map"):
-                errors = map_errors(
-                    posterior.model, problem.simulator, posterior.draws(), posterior.data
-                )
+                simulator = cast(Simulator, problem.simulator)
+                errors = map_errors(posterior.model, simulator, posterior.draws(), posterior.data)
         attributes = {
             SCALED_NOISE: problem.scaled_noise, MAP_ERRORS: errors.sizes, MAP_MOVES: errors.moves,
             SECONDS: stages.seconds,

@@ -23,6 +23,7 @@ from calibrate.project.calibration import certify_and_keep, infer, report
 from calibrate.project.problem import simulator_of
 from calibrate.project.run import Run
 from emulator.core.store import check_folder
+from emulator.scenes.specimen import with_mesh
 from emulator.surrogates.network.graph import mesh_edges
 
 if TYPE_CHECKING:
@@ -75,7 +76,8 @@ def run_demo(
         result["identifiability"] = identify(posterior)
         return result
     forward = posterior.model.full
-    truth = simulator_of(forward.scene, run.load_steps)(forward.scene.theta(**run.truth))
+    simulator = simulator_of(forward.scene, run.load_steps)
+    truth = simulator.solve(forward.scene.theta(**run.truth)).require_converged().displacement
     thetas = np.asarray(posterior.thetas())
     rows = np.linspace(0, len(thetas) - 1, 200).astype(int)
     fields = np.asarray(jax.jit(lambda t: jax.lax.map(forward, t))(thetas[rows]))
@@ -100,7 +102,7 @@ def _draw_beam(
     scene = posterior.model.forward.scene
     points = cast(DisplacementPoints, posterior.model.observe.parts[DISPLACEMENT]).points
     measured = points + np.asarray(posterior.data[DISPLACEMENT])
-    mesh, draws = scene.mesh, posterior.draws()
+    mesh, draws = with_mesh(scene).mesh, posterior.draws()
     figure, (side, joint) = pyplot().subplots(
         1, 2, figsize=(12.5, 4.8), width_ratios=(1.9, 1.0), layout="constrained"
     )

@@ -26,20 +26,25 @@ from calibrate.statistical_model import Model, with_error
 from calibrate.statistical_model.errors import with_described_errors
 from calibrate.statistical_model.load_states import boxed, known_thetas, load_states
 from calibrate.statistical_model.model import model
-from emulator.catalogue import find_scene
+from emulator.catalogue import find_problem
 from emulator.core.errors import InputError
 from emulator.fem import NewtonOptions, Simulator
-from emulator.scenes.scene import Scene
+from emulator.fem.solution import EquilibriumSolver
+from emulator.scenes.forward_problem import ForwardProblem
+from emulator.scenes.specimen import Specimen, with_mesh
 from emulator.surrogates import registry
-from emulator.surrogates.fem import fem_forward
+from emulator.surrogates.fem import by_solver
+from emulator.surrogates.homogeneous import homogeneous
 from emulator.surrogates.protocol import ForwardMap, Ingredients
 
-_SIMULATORS: dict[tuple[str, int], Simulator] = {}  # the one used last at the end
+_SIMULATORS: dict[tuple[str, int], EquilibriumSolver] = {}  # the one used last at the end
 _MOST_SIMULATORS = 2  # each holds a scene's mesh and the compiled programs
 
 
-def simulator_of(scene: Scene, load_steps: int = 1) -> Simulator:
+def simulator_of(scene: ForwardProblem, load_steps: int = 1) -> EquilibriumSolver:
     """Return this process's simulator of ``scene``, found by the scene's fingerprint.
+
+    A specimen is solved state by state, by its law.
 
     A simulator compiles its programs when it first solves, which takes longer than the solve.
     Synthetic data, the forward map, the certificate and the report of a run therefore share one
@@ -48,7 +53,10 @@ def simulator_of(scene: Scene, load_steps: int = 1) -> Simulator:
     key = (scene.fingerprint, load_steps)
     simulator = _SIMULATORS.pop(key, None)
     if simulator is None:
-        simulator = Simulator(scene, NewtonOptions.load_steps(load_steps))
+        if isinstance(scene, Specimen):
+            simulator = homogeneous(scene)
+        else:
+            simulator = Simulator(with_mesh(scene), NewtonOptions.load_steps(load_steps))
     _SIMULATORS[key] = simulator
     if len(_SIMULATORS) > _MOST_SIMULATORS:
         del _SIMULATORS[next(iter(_SIMULATORS))]
@@ -66,13 +74,13 @@ class Problem:
     """
 
     run: Run
-    scene: Scene
+    scene: ForwardProblem
     observe: Observations
     data: Mapping[str, np.ndarray] | None
 
     @property
-    def simulator(self) -> Simulator:
-        """FEM of the scene, in the run's load steps."""
+    def simulator(self) -> EquilibriumSolver:
+        """FEM of the scene, in the run's load steps, or the solver of the specimen."""
         return simulator_of(self.scene, self.run.load_steps)
 
     def change(self, **entries: Any) -> Problem:
@@ -93,7 +101,9 @@ class Problem:
         ]
 
 
-def read_problem(run: Run | Problem, where: str = "", *, scene: Scene | None = None) -> Problem:
+def read_problem(
+    run: Run | Problem, where: str = "", *, scene: ForwardProblem | None = None
+) -> Problem:
     """Build the scene of a run, parse its data, and check that its names fit them.
 
     The forward map is not built and nothing is solved: a mistake is reported before long work.
@@ -115,7 +125,7 @@ def read_problem(run: Run | Problem, where: str = "", *, scene: Scene | None = N
         return run
     with naming(where):
         run.sampling()
-        scene = find_scene(run.scene, run.root) if scene is None else scene
+        scene = find_problem(run.scene, run.root) if scene is None else scene
         if run.is_synthetic:
             names = {**run.known, **run.truth}
             states = tuple(dict.fromkeys(state for _, state in map(split, names) if state))
@@ -158,7 +168,8 @@ def with_data(problem: Problem) -> Problem:
     run, observe = problem.run, problem.observe
     thetas = known_thetas(problem.scene, observe.states, {**run.known, **run.truth})
     noises = run.synthetic_noise(observe)
-    fields = [problem.simulator(theta)[observe.nodes] for theta in thetas]
+    solutions = (problem.simulator.solve(theta).require_converged() for theta in thetas)
+    fields = [solution.displacement[observe.nodes] for solution in solutions]
     exact = jax.jit(observe)(jnp.stack(fields), thetas)
     rng = np.random.default_rng([run.seed, 1])
     data = {
@@ -171,14 +182,14 @@ def with_data(problem: Problem) -> Problem:
     return replace(problem, data=data)
 
 
-def make_data(run: Run, scene: Scene) -> tuple[Observations, dict[str, np.ndarray]]:
+def make_data(run: Run, scene: ForwardProblem) -> tuple[Observations, dict[str, np.ndarray]]:
     """Return the observations and the data of a run, in ``scene`` instead of the run's own."""
     problem = with_data(read_problem(run, scene=scene))
     assert problem.data is not None
     return problem.observe, dict(problem.data)
 
 
-def ingredients(run: Run, scene: Scene, *, progress: bool = False) -> Ingredients:
+def ingredients(run: Run, scene: ForwardProblem, *, progress: bool = False) -> Ingredients:
     """Return what the forward map of a run is made of."""
     simulator = simulator_of(scene, run.load_steps)
     return Ingredients(scene, simulator, run.emulator, run.seed, progress=progress)
@@ -241,6 +252,6 @@ def build_model(problem: Problem, *, progress: bool = False) -> tuple[Model, Map
 
 def by_fem(model: Model, load_steps: int = 1) -> Model:
     """Return ``model`` with FEM as its forward map, to make data for checks of the model."""
-    whole = fem_forward(simulator_of(model.forward.scene, load_steps), model.full)
+    whole = by_solver(simulator_of(model.forward.scene, load_steps), model.full)
     error = model.error if model.error is not None and model.error.of_fem else None
     return replace(model, full=whole, forward=whole.at(model.observe.nodes), error=error)

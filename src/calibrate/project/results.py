@@ -34,7 +34,7 @@ from calibrate.model_error import ModelError
 from calibrate.posterior import Posterior, read_tree
 from calibrate.project.problem import Problem, ingredients, model_of
 from calibrate.project.run import Run
-from emulator.catalogue import find_scene
+from emulator.catalogue import find_problem
 from emulator.core import schema
 from emulator.core.errors import InputError
 from emulator.core.store import exclusive, read_arrays, read_json, save_arrays, write_json
@@ -130,7 +130,7 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
             f"{folder} holds a population; name one of its members, {folder / MEMBERS}/NAME"
         )
     run = schema.read_json_as(Run, folder / RUN)
-    scene = find_scene(run.scene, run.root)
+    scene = find_problem(run.scene, run.root)
     tree = read_tree(path)
     if tree.attrs.get("scene_fingerprint") != scene.fingerprint:
         raise InputError(f"{path} was made for another scene than '{run.scene}'")

@@ -26,7 +26,7 @@ from emulator.surrogates import registry, shipped
 
 if TYPE_CHECKING:
     from calibrate.samplers import Sampler
-    from emulator.scenes.scene import Scene
+    from emulator.scenes.forward_problem import ForwardProblem
 
 SYNTHETIC = "synthetic"
 """The word for data that FEM makes."""
@@ -140,7 +140,7 @@ class Run:
         length = {"warmup": self.warmup, "draws": self.draws, "chains": self.chains}
         return sampler, options_from(sampler, self.sampler_options, **length)
 
-    def named(self, observe: Observations, scene: Scene | None = None) -> Run:
+    def named(self, observe: Observations, scene: ForwardProblem | None = None) -> Run:
         """Return the run with every noise by name; defaults fit the size of ``scene``."""
         scales = _by_name(self.noise_scale, observe, "noise-scale")
         noise = _by_name(self.noise, observe, "noise")

@@ -18,8 +18,7 @@ from emulator.mechanics.laws import Law, find_law
 from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.file import read_scene
 from emulator.scenes.parameter_space import Parameter
-from emulator.scenes.scene import Scene
-from emulator.scenes.specimen import measured_states, read_states, specimen
+from emulator.scenes.specimen import Specimen, read_states, require_specimen, specimen
 from emulator.scenes.states import AXES, States, pull_columns, with_unit
 from emulator.scenes.tube import Tube
 
@@ -44,13 +43,13 @@ class SpecimenDraft(NamedTuple):
     """Files that were written.
 
     path, scene_path : the experiment file, and the scene file that it names.
-    scene : the scene that the latter describes.
+    scene : the specimen that the latter describes.
     notes : sentences, one for each guess.
     """
 
     path: Path
     scene_path: Path
-    scene: Scene
+    scene: Specimen
     notes: tuple[str, ...]
 
 
@@ -126,7 +125,7 @@ def draft_specimen(
         text += "\n".join(["", *_GRIPS, ""])
     scene_path.write_text(text, encoding="utf-8")
     try:
-        scene = read_scene(scene_path)
+        scene = require_specimen(read_scene(scene_path))
     except InputError:
         scene_path.unlink()
         raise
@@ -166,9 +165,8 @@ def _size(table: Path, given: States, tube: Tube | None) -> tuple[_Sizes, float]
     for name, (part, most) in sizes.items():
         if not most > 0.0:
             raise InputError(f"data file {table}: each {name} is {part.at_rest or 'zero'}")
-    neutral_states = measured_states(neutral)
-    motion = np.abs(neutral_states.gradients).max(axis=(1, 2))
-    stress = np.abs(neutral_states.pulls).max(axis=1)
+    motion = np.abs(neutral.measured.gradients).max(axis=(1, 2))
+    stress = np.abs(neutral.measured.pulls).max(axis=1)
     stretches = ways.pop(Stretch.name, None)
     if stretches is not None:
         motion = np.maximum(motion, stretches.max(axis=1))

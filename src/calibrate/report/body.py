@@ -12,10 +12,11 @@ import numpy as np
 import plotly.graph_objects as go
 
 from calibrate.posterior import Posterior
-from emulator.fem import Simulator
 from emulator.fem.fields import element_fields
+from emulator.fem.solution import EquilibriumSolver
 from emulator.geometry.facets import surface_mesh
 from emulator.scenes.scene import Scene
+from emulator.scenes.specimen import with_mesh
 
 _DRAWS = 20
 _MOMENTS = 100  # draws from which mean and sd are computed
@@ -25,7 +26,7 @@ _SIGHT = np.array([1.45, 1.45, 0.9])  # from the body towards the eye
 _WIDTH = 1.3  # of the picture, in its heights
 
 
-def body_figure(posterior: Posterior, simulator: Simulator | None) -> go.Figure:
+def body_figure(posterior: Posterior, simulator: EquilibriumSolver | None) -> go.Figure:
     """Return the deformed surface with a slider over draws and a menu of colours.
 
     With several load states, the last is shown, and a button plays the mean shapes of all.
@@ -33,7 +34,7 @@ def body_figure(posterior: Posterior, simulator: Simulator | None) -> go.Figure:
     simulator : FEM, which the map is compared with at the mean theta; None for no comparison.
     """
     model = posterior.model
-    scene = model.forward.scene
+    scene = with_mesh(model.forward.scene)
     thetas = posterior.thetas(model.states.states[-1])
     rows = np.linspace(0, len(thetas) - 1, min(_MOMENTS, len(thetas))).astype(int)
     centre = thetas.mean(axis=0)

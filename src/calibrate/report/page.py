@@ -26,7 +26,7 @@ from calibrate.report.body import body_figure
 from calibrate.report.parts import Verdict
 from emulator.core.errors import InputError
 from emulator.core.store import read_json, replacing
-from emulator.scenes.specimen import is_specimen
+from emulator.scenes.specimen import Specimen, with_mesh
 
 _SHEET = 0.1  # thickness of a sheet, as a share of its width
 _SHIFTS = {
@@ -72,7 +72,7 @@ def html_of(
     draws = [charts.traces(labels, in_chains, posterior.model.sampled_priors)]
     draws += [charts.pairs(labels, posterior.draws())] if len(labels) > 1 else []
     body: list[tuple[str, list[Markup]]] = []
-    if not is_specimen(scene):
+    if not isinstance(scene, Specimen):
         of_body = parts.note(
             "Drag to turn. The slider goes through draws of the posterior, and the mean shape of "
             "each load state; the menu changes the colour; fibres and the mesh are in the legend."
@@ -170,9 +170,10 @@ def _known(posterior: Posterior) -> list[Markup]:
 def _sheet(posterior: Posterior) -> list[Markup]:
     """Return what forces tell of a sheet: its moduli times its thickness, which was assumed."""
     model, scene = posterior.model, posterior.model.forward.scene
-    thickness, width, _ = np.sort(np.ptp(scene.mesh.nodes, axis=0))
-    forces = any(part.unit == "N" for part in model.observe.parts.values())
-    if not forces or thickness > _SHEET * width:
+    if not any(part.unit == "N" for part in model.observe.parts.values()):
+        return []
+    thickness, width, _ = np.sort(np.ptp(with_mesh(scene).mesh.nodes, axis=0))
+    if thickness > _SHEET * width:
         return []
     draws, moduli = posterior.draws(), (*scene.law.shape_moduli, "prestress")
     told = [name for name in moduli if name in draws]
@@ -189,7 +190,7 @@ def _sheet(posterior: Posterior) -> list[Markup]:
 
 def _terms(posterior: Posterior) -> list[Markup]:
     """Return which terms a specimen's law needs, where its data are linear in the moduli."""
-    if not is_specimen(posterior.model.forward.scene):
+    if not isinstance(posterior.model.forward.scene, Specimen):
         return []
     try:
         found = find_terms(posterior.model, posterior.data)

@@ -48,6 +48,7 @@ from emulator.core.display import counting
 from emulator.core.errors import InputError, SolverError
 from emulator.fem import Simulator
 from emulator.fem.compiled import compiled
+from emulator.fem.solution import EquilibriumSolver
 
 FEWEST = 8  # FEM runs from which an error is learned
 _MODES = 12
@@ -143,7 +144,7 @@ def _marginaliser(model: Model) -> Callable[[Sequence[Systematic]], ModelError]:
 
 def with_error(
     model: Model,
-    simulator: Simulator,
+    simulator: EquilibriumSolver,
     runs: int = 24,
     *,
     of_mesh: bool = False,

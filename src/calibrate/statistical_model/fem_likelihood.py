@@ -17,9 +17,8 @@ from jax.flatten_util import ravel_pytree
 
 from calibrate.statistical_model.model import Data, Model
 from emulator.core.errors import InputError, SolverError
-from emulator.fem import Simulator
 from emulator.fem.campaign import Solver, solve_rows
-from emulator.fem.energy import volume_ratio
+from emulator.fem.solution import EquilibriumSolver
 
 
 class Likelihoods(NamedTuple):
@@ -51,12 +50,12 @@ class FEMLikelihood:
     """FEM's log likelihood under ``model``; solves start from the cheap map's prediction.
 
     model : the statistical model.
-    simulator : the FEM simulator of the model's scene.
+    simulator : the simulator of the model's scene, or of its specimen.
 
     :class:`InputError` where the simulator is for another scene.
     """
 
-    def __init__(self, model: Model, simulator: Simulator) -> None:
+    def __init__(self, model: Model, simulator: EquilibriumSolver) -> None:
         if simulator.scene.fingerprint != model.forward.scene.fingerprint:
             raise InputError("the simulator's scene is not the posterior's")
         self.model, self.simulator = model, simulator
@@ -132,12 +131,7 @@ class FEMLikelihood:
 
     def _stable(self, fields: list[jax.Array], thetas: jax.Array) -> bool | None:
         """Return whether every state's equilibrium is a minimum of the energy, if there is one."""
-        scene = self.simulator.scene
-        if scene.loaded_by:  # without a system of its own: one at rest for each theta
-            has_energy = all(load.has_potential for load in scene.loads)
-        else:
-            has_energy = not self.simulator.system.forces
-        if not has_energy:
+        if not self.simulator.has_energy:
             return None
         return all(
             self.simulator.is_stable(u, theta) for u, theta in zip(fields, thetas, strict=True)
@@ -168,5 +162,5 @@ class FEMLikelihood:
         """Return the log likelihood, the means and the smallest volume ratio."""
         means = self.model.observe(fields[:, self.model.observe.nodes], thetas)
         value = self.model.fem_log_likelihood(draw, means, data)
-        ratios = [volume_ratio(self.simulator.scene, u) for u in fields]
+        ratios = [self.simulator.volume_ratio(u) for u in fields]
         return value, means, jnp.min(jnp.stack(ratios))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, cast
 
 import jax
 import jax.numpy as jnp
@@ -16,9 +16,12 @@ from calibrate.measurements import Observations
 from calibrate.measurements.outputs import on_finer
 from calibrate.statistical_model.model import Model
 from emulator.accuracy.mesh_error import MeshError, MeshErrorEstimate, mesh_error
+from emulator.core.errors import InputError
 from emulator.fem import Simulator
 from emulator.fem.campaign import at_once
+from emulator.fem.solution import EquilibriumSolver
 from emulator.surrogates.gripped import GrippedSpecimen
+from emulator.surrogates.homogeneous import Homogeneous
 
 Known = Sequence[MeshErrorEstimate]
 
@@ -61,7 +64,7 @@ class FinerFEM(Protocol):
         ...
 
 
-def finer_fem(model: Model, simulator: Simulator) -> FinerFEM:
+def finer_fem(model: Model, simulator: EquilibriumSolver) -> FinerFEM:
     """Return the FEM that is closer to what was measured.
 
     Raises
@@ -70,9 +73,11 @@ def finer_fem(model: Model, simulator: Simulator) -> FinerFEM:
         There is none: a specimen without grips, a finer mesh that is too large, a load that it
         cannot have, or an observation that says nothing of grips.
     """
-    if simulator.scene.grips is not None:
+    if isinstance(simulator, Homogeneous):
+        if simulator.scene.grips is None:
+            raise InputError("the states of a specimen are homogeneous on any mesh")
         return _Gripped(model, GrippedSpecimen(simulator.scene))
-    error = mesh_error(simulator)
+    error = mesh_error(cast(Simulator, simulator))
     return _OnFinerMesh(model, error, on_finer(error, model.observe))
 
 

@@ -23,7 +23,7 @@ import numpyro.distributions as dist
 from calibrate.priors import box_prior
 from calibrate.state_names import in_state, split
 from emulator.core.errors import InputError
-from emulator.scenes.scene import Scene
+from emulator.scenes.forward_problem import ForwardProblem
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class LoadStates:
 
 
 def load_states(
-    scene: Scene,
+    scene: ForwardProblem,
     states: tuple[str, ...],
     prior: Mapping[str, dist.Distribution] | None = None,
     known: Mapping[str, float] | None = None,
@@ -105,7 +105,9 @@ def boxed(
     return frozenset(name for name, base in bases.items() if not {name, base} & named)
 
 
-def known_thetas(scene: Scene, states: tuple[str, ...], values: Mapping[str, float]) -> jax.Array:
+def known_thetas(
+    scene: ForwardProblem, states: tuple[str, ...], values: Mapping[str, float]
+) -> jax.Array:
     """Return theta (S, p) of states in which ``values`` names every parameter.
 
     :class:`InputError` for a name that is no parameter or state, a parameter without a value or
@@ -119,7 +121,10 @@ def known_thetas(scene: Scene, states: tuple[str, ...], values: Mapping[str, flo
 
 
 def _entries(
-    scene: Scene, states: tuple[str, ...], prior: Collection[str], known: Mapping[str, float]
+    scene: ForwardProblem,
+    states: tuple[str, ...],
+    prior: Collection[str],
+    known: Mapping[str, float],
 ) -> tuple[tuple[str | float, ...], ...]:
     """Return the entries of :class:`LoadStates`."""
     by_state = set(scene.load_parameters) if states != ("",) else set()

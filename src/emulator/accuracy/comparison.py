@@ -17,6 +17,7 @@ from emulator.fem.reactions import SupportForce, support_forces
 from emulator.geometry.facets import Cavity
 from emulator.scenes.loads.force import MN_PER_N
 from emulator.scenes.scene import Scene, cavity_sets
+from emulator.scenes.specimen import with_mesh
 from emulator.surrogates.protocol import ForwardMap
 
 UNITS = {
@@ -139,8 +140,8 @@ def case_errors(forward: ForwardMap, thetas: jax.Array, reference: jax.Array) ->
     :class:`InputError` for a map over some nodes, or a load without a potential;
     :class:`SolverError` where the map has no valid prediction for any case.
     """
-    scene = forward.scene
-    if len(forward.nodes) != len(scene.mesh.nodes):
+    scene = with_mesh(forward.scene)
+    if len(forward.nodes) != scene.node_count:
         raise InputError("evaluation needs a forward map over all nodes")
     cavities = [Cavity(scene.mesh, name) for name in cavity_sets(scene)]
     # The forces of a mesh that is the loaded one need displacements from rest, too.

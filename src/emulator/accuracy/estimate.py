@@ -63,6 +63,7 @@ from emulator.fem.simulator import Simulator
 from emulator.fem.solution import NewtonState, Status
 from emulator.mechanics.kinematics import Barriers, Strain
 from emulator.scenes.scene import Scene
+from emulator.scenes.specimen import with_mesh
 from emulator.scenes.tissue import Tissue
 from emulator.surrogates.protocol import ForwardMap
 
@@ -319,8 +320,8 @@ class ErrorBar:
     """
 
     def __init__(self, forward: ForwardMap, simulator: Simulator) -> None:
-        self.forward, self.scene = forward, forward.scene
-        if len(forward.nodes) != len(self.scene.mesh.nodes):
+        self.forward, self.scene = forward, with_mesh(forward.scene)
+        if len(forward.nodes) != self.scene.node_count:
             raise InputError("an error bar needs a forward map over all nodes")
         if self.scene.fingerprint != simulator.scene.fingerprint:
             raise InputError(

@@ -44,7 +44,6 @@ from emulator.fem.simulator import Simulator
 from emulator.fem.stress_iterates import StressIterates, applies
 from emulator.scenes.finer import Finer, finer
 from emulator.scenes.scene import Scene
-from emulator.scenes.specimen import is_specimen
 
 LARGEST = 60_000
 """Nodes of the largest finer mesh that is solved on; beyond, a factorisation takes a minute."""
@@ -217,11 +216,9 @@ def mesh_error(simulator: Simulator | Scene, *, most: int = LARGEST) -> MeshErro
     Raises
     ------
     InputError
-        A finer mesh of more nodes, a load that it cannot have, or a specimen.
+        A finer mesh of more nodes, or a load that it cannot have.
     """
     coarse = simulator if isinstance(simulator, Simulator) else Simulator(simulator)
-    if is_specimen(coarse.scene):
-        raise InputError("the states of a specimen are homogeneous on any mesh")
     refined = finer(coarse.scene)
     if (count := len(refined.scene.mesh.nodes)) > most:
         raise InputError(

@@ -33,6 +33,7 @@ import numpy as np
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import Blocks
 from emulator.mechanics.kinematics import Barriers, Strain, determinant
+from emulator.scenes.forward_problem import ForwardProblem
 from emulator.scenes.part import LocalForce, LocalTerm, Values
 from emulator.scenes.scene import Scene
 from emulator.scenes.tissue import Tissue
@@ -40,7 +41,7 @@ from emulator.scenes.tissue import Tissue
 Energy = Callable[[jax.Array, jax.Array], jax.Array]
 
 
-def require_rest(scene: Scene) -> None:
+def require_rest(scene: ForwardProblem) -> None:
     """Raise :class:`InputError` for a scene whose mesh is the shape under load."""
     if scene.loaded_by:
         raise InputError(
@@ -67,7 +68,7 @@ def volume_ratio(scene: Scene, u: jax.Array) -> jax.Array:
     return at_points(determinant, H + jnp.eye(3, dtype=H.dtype))
 
 
-def parameters_at(scene: Scene, theta: jax.Array) -> Callable[[Tissue], list[jax.Array]]:
+def parameters_at(scene: ForwardProblem, theta: jax.Array) -> Callable[[Tissue], list[jax.Array]]:
     """Return the law's parameters as a function of a point's tissue, at ``theta`` (p,).
 
     The tissue's stiffness scales the moduli that the law names in ``shape_moduli``.
@@ -84,7 +85,9 @@ def parameters_at(scene: Scene, theta: jax.Array) -> Callable[[Tissue], list[jax
     return parameters
 
 
-def point_energy(scene: Scene, theta: jax.Array, barriers: Barriers | None = None) -> Callable:
+def point_energy(
+    scene: ForwardProblem, theta: jax.Array, barriers: Barriers | None = None
+) -> Callable:
     """Return ``W(H, tissue)`` in kPa, of one displacement gradient (3, 3), at ``theta`` (p,)."""
     law, parameters = scene.law, parameters_at(scene, theta)
 

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 
 from emulator.fem.energy import parameters_at, point_energy
 from emulator.mechanics.measures import Measures, measures_read
-from emulator.scenes.scene import Scene
+from emulator.scenes.forward_problem import ForwardProblem
 from emulator.scenes.tissue import Tissue
 
 _BISECTIONS = 7
@@ -26,7 +26,7 @@ _REFINEMENTS = 3
 
 
 def stress_and_moduli(
-    scene: Scene, theta: jax.Array
+    scene: ForwardProblem, theta: jax.Array
 ) -> Callable[[jax.Array, Tissue], tuple[jax.Array, jax.Array]]:
     """Return ``(H, tissue) -> dW/dH (3, 3), d2W/dH2 (3, 3, 3, 3)``, both in kPa."""
     if measures_read(scene.law) is None:
@@ -44,7 +44,7 @@ def stress_and_moduli(
 class MaterialPoint:
     """One integration point of a scene whose law reads nothing but measures, at ``theta`` (p,)."""
 
-    scene: Scene
+    scene: ForwardProblem
     theta: jax.Array
 
     @cached_property

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.errors import SolverError
+from emulator.scenes.forward_problem import ForwardProblem
 
 
 class Status(IntEnum):
@@ -82,6 +83,36 @@ class Solution(NamedTuple):
                 f"{what}{position}: {Status(int(status[failures[0]])).text} ({limit})"
             )
         return self
+
+
+class EquilibriumSolver(Protocol):
+    """What solves a scene or a specimen: a simulator, or the map of a specimen's states.
+
+    scene : the scene or the specimen that is solved.
+    has_energy : whether an equilibrium is a minimum or a saddle of some energy.
+    """
+
+    @property
+    def scene(self) -> ForwardProblem: ...  # noqa: D102
+
+    @property
+    def has_energy(self) -> bool: ...  # noqa: D102
+
+    def solve(self, theta: jax.Array, start: jax.Array | None = None) -> Solution:
+        """Return the equilibrium at ``theta`` (p,), sought from ``start`` (n, 3) mm if given."""
+        ...
+
+    def sensitivities(self, u: jax.Array, theta: jax.Array) -> jax.Array:
+        """Return the derivatives (p, n, 3) of the equilibrium ``u`` (n, 3) mm in ``theta``."""
+        ...
+
+    def is_stable(self, u: jax.Array, theta: jax.Array) -> bool:
+        """Return whether the equilibrium ``u`` (n, 3) mm is a minimum of the energy."""
+        ...
+
+    def volume_ratio(self, u: jax.Array) -> jax.Array:
+        """Return J = det F at every point of the body, of whatever shape."""
+        ...
 
 
 class RoundOff(NamedTuple):

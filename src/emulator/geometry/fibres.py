@@ -120,13 +120,12 @@ def check_across(sheets: np.ndarray, fibres: np.ndarray) -> None:
         raise InputError(f"sheets are not across the fibres (cosine {along:.2g})")
 
 
-def checked_directions(vectors: np.ndarray, mesh: Mesh, kind: str) -> np.ndarray:
-    """Return unit vectors (m, q, 3), or (m, 3), of each element of ``mesh``, frozen.
+def checked_directions(vectors: np.ndarray, count: int, points: int, kind: str) -> np.ndarray:
+    """Return the unit vectors (m, q, 3), or (m, 3), of ``count`` elements of ``points``, frozen.
 
     :class:`InputError` for another shape, or no unit vectors; ``kind`` says of what.
     """
     frozen = frozen_array(vectors)
-    count, points = len(mesh.elements), len(quadrature_points(mesh.order))
     if frozen.shape not in ((count, 3), (count, points, 3)):
         at_points = f" or ({count}, {points}, 3)" if points > 1 else ""
         raise InputError(f"{kind} have shape {frozen.shape}; expected ({count}, 3){at_points}")

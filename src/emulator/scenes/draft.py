@@ -29,6 +29,7 @@ from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.file import read_scene
 from emulator.scenes.loads import CavityPressure, FollowerPressure, Gravity, Load, SurfacePressure
 from emulator.scenes.scene import Scene
+from emulator.scenes.specimen import with_mesh
 from emulator.scenes.supports.dirichlet import Support, loose_parts
 
 _METRES = 0.6  # a body smaller than this in all directions is taken to be in m
@@ -152,7 +153,7 @@ def draft_scene(
         all_notes = (*notes, note, *_unused(mesh, entries))
         out.write_text(_header(mesh, all_notes) + entries, encoding="utf-8")
         try:
-            return Draft(out, read_scene(out), all_notes)
+            return Draft(out, with_mesh(read_scene(out)), all_notes)
         except InputError as error:
             out.unlink()
             failure = re.sub(rf"^scene file {re.escape(str(out))}(, line \d+)?: ", "", str(error))

@@ -17,8 +17,8 @@ import jax.numpy as jnp
 from emulator.core.errors import InputError
 from emulator.geometry.fibres import of_elements
 from emulator.geometry.refinement import corner_parents, to_linear
+from emulator.scenes.forward_problem import directions_read
 from emulator.scenes.scene import Scene
-from emulator.scenes.scene_data import directions_read
 from emulator.scenes.tissue import effective_angles, stiffness_quantities
 
 

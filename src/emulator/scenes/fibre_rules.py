@@ -132,15 +132,24 @@ class Uniform:
 
     def directions(self, mesh: Mesh) -> Directions:
         """Return the directions, made unit length."""
-        sheets = None if self.sheets is None else _everywhere(mesh, self.sheets)
-        return _everywhere(mesh, self.direction), sheets
+        return self.repeated(len(mesh.elements))[:2]
 
     def angles_in(self, mesh: Mesh) -> tuple[FibreAngles, ...]:
         """Return the rotation by the angle, where it is a parameter."""
-        if self.angle is None or self.about is None:
-            return ()
-        share = np.ones(len(mesh.elements))
-        return (FibreAngles(_everywhere(mesh, self.about), {self.angle: share}),)
+        return self.repeated(len(mesh.elements))[2]
+
+    def repeated(self, count: int) -> tuple[np.ndarray, np.ndarray | None, tuple[FibreAngles, ...]]:
+        """Return fibres, sheets and rotations of ``count`` elements or states."""
+        fibres, sheets, about = (
+            None
+            if vector is None
+            else np.tile(np.asarray(vector) / np.linalg.norm(vector), (count, 1))
+            for vector in (self.direction, self.sheets, self.about)
+        )
+        assert fibres is not None
+        if self.angle is None or about is None:
+            return fibres, sheets, ()
+        return fibres, sheets, (FibreAngles(about, {self.angle: np.ones(count)}),)
 
 
 def _rotation(depth: np.ndarray, axis: np.ndarray, angles: Angles) -> tuple[FibreAngles, ...]:
@@ -150,11 +159,6 @@ def _rotation(depth: np.ndarray, axis: np.ndarray, angles: Angles) -> tuple[Fibr
         if isinstance(angle, str):
             shares[angle] = shares.get(angle, 0.0) + share
     return (FibreAngles(axis, shares),) if shares else ()
-
-
-def _everywhere(mesh: Mesh, vector: Axis) -> np.ndarray:
-    """Return the unit vector along ``vector`` for every element, (m, 3)."""
-    return np.tile(np.asarray(vector) / np.linalg.norm(vector), (len(mesh.elements), 1))
 
 
 FIBRE_RULES: dict[str, type[FibreRule]] = {

@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,13 +16,13 @@ from emulator.geometry.mesh import Mesh
 from emulator.geometry.refinement import to_quadratic
 from emulator.geometry.side_by_side import check_name, shifted, side_by_side
 from emulator.mechanics.laws import Law, find_law
+from emulator.scenes.fibre_rules import Uniform
+from emulator.scenes.forward_problem import directions_read
 from emulator.scenes.grips import Grips, Learned
 from emulator.scenes.parameter_space import Parameter
-from emulator.scenes.part import Load
 from emulator.scenes.scene import Scene
-from emulator.scenes.scene_data import directions_read
-from emulator.scenes.specimen import body_of, read_states
-from emulator.scenes.supports.dirichlet import Support
+from emulator.scenes.specimen import Specimen, read_states
+from emulator.scenes.tissue import FibreAngles
 from emulator.scenes.tube import Tube
 
 if TYPE_CHECKING:  # pydantic is imported when a scene file is read, not with the package
@@ -33,10 +33,15 @@ Regions = np.ndarray | None
 
 # A node this far from a plane, as a fraction of the body's size, is on it.
 _ON_PLANE = 1e-8
+# Keys of files of a mesh that those of a specimen do not have.
+_OF_MESHES = (
+    "mesh", "bodies", "regions", "stiffness_modes", "supports", "loads", "order", "dilatation",
+    "loaded_by", "node_sets", "facet_sets",
+)  # fmt: skip
 
 
-def read_scene(path: str | Path) -> Scene:
-    """Return the scene that a TOML file describes; the path of the mesh is relative to the file.
+def read_scene(path: str | Path) -> Scene | Specimen:
+    """Return what a TOML file describes; paths of a mesh and of a table are relative to the file.
 
     Raises
     ------
@@ -51,89 +56,93 @@ def read_scene(path: str | Path) -> Scene:
     file = parse(SceneFile, source)
     with source.at("law"):
         law = find_law(file.law)
-    supports, loads, regions = file.supports, file.loads, None
-    with source.at("tube", table=("tube",)):
-        tube = _tube(file)
-    if file.specimen is not None:
-        body, supports, loads = _specimen(path.parent, file, tube, source)
-        regions = tube.regions(len(body.mesh.elements)) if tube is not None else None
-    elif not supports:
-        raise source.error("key 'supports' is missing; expected tables [[supports]]")
-    else:
-        read = _several_bodies if file.bodies else _one_body
-        body, regions = read(path.parent, file, law, source)
-    with source.at("stiffness_modes"):
-        modes = _modes(path.parent, file)
-    mesh, fibres, sheets = _with_planes(body.mesh, file, source), body.fibres, body.sheets
-    if file.fibres is not None:
-        with source.at("fibres", table=("fibres",)):
-            fibres, sheets = file.fibres.directions(mesh)
+    entries: dict[str, Any] = {
+        "name": path.stem,
+        "law": law,
+        "origin": {"scene": "file", "path": str(path.resolve())},
+        "constants": file.constants,
+        "fibre_rule": file.fibres,
+    }
+    of_kind = _on_mesh if file.specimen is None else _of_specimen
+    make, of_body = of_kind(path.parent, file, law, source)
     parameters = []
     for name, entry in file.parameters.items():
         with source.at("parameters", name):
             parameters.append(Parameter(name, entry.unit, *entry.range, entry.scale))
-    _check_sets(mesh, source)
-    with source.at("grips", table=("grips",)):
-        grips = _grips(path.parent, file)
     try:
-        return Scene(
-            name=path.stem,
-            mesh=mesh,
-            law=law,
-            origin={"scene": "file", "path": str(path.resolve())},
-            fibres=fibres,
-            fibre_rule=file.fibres,
-            angles=file.fibres.angles_in(mesh) if file.fibres is not None else (),
-            sheets=sheets if law.sheets else None,
-            regions=regions,
-            stiffness_modes=modes,
-            parameters=tuple(parameters),
-            loads=loads,
-            supports=supports,
-            constants=file.constants,
-            dilatation=file.dilatation,
-            loaded_by=file.loaded_by,
-            grips=grips,
-            homogeneous=file.grips == "none",
-            tube=tube,
-        )
+        return make(parameters=tuple(parameters), **entries, **of_body)
     except InputError as error:
         raise source.error(str(error), _quantity_in(str(error), file)) from error
 
 
-def _specimen(
-    folder: Path, file: SceneFile, tube: Tube | None, source: Source
-) -> tuple[Body, tuple[Support, ...], tuple[Load, ...]]:
-    """Return the states of the table ``specimen`` as bodies, and what holds and pulls them."""
-    for key in ("mesh", "bodies", "regions", "stiffness_modes", "supports", "loads", "order"):
+Entries = dict[str, Any]
+"""Fields of a scene or a specimen, by name."""
+
+
+def _on_mesh(
+    folder: Path, file: SceneFile, law: Law, source: Source
+) -> tuple[type[Scene], Entries]:
+    """Return the fields of a scene that its body, its loads and its supports give."""
+    if not file.supports:
+        raise source.error("key 'supports' is missing; expected tables [[supports]]")
+    for table in ("grips", "tube"):
+        if table in source.data:
+            problem = f"only a specimen has {table}; give its table as 'specimen'"
+            raise source.error(problem, (table,))
+    read = _several_bodies if file.bodies else _one_body
+    body, regions = read(folder, file, law, source)
+    with source.at("stiffness_modes"):
+        modes = _modes(folder, file)
+    mesh, fibres, sheets = _with_planes(body.mesh, file, source), body.fibres, body.sheets
+    angles: tuple[FibreAngles, ...] = ()
+    if file.fibres is not None:
+        with source.at("fibres", table=("fibres",)):
+            fibres, sheets = file.fibres.directions(mesh)
+            angles = file.fibres.angles_in(mesh)
+    _check_sets(mesh, source)
+    return Scene, {
+        "mesh": mesh,
+        "fibres": fibres,
+        "sheets": sheets if law.sheets else None,
+        "angles": angles,
+        "regions": regions,
+        "stiffness_modes": modes,
+        "loads": file.loads,
+        "supports": file.supports,
+        "dilatation": file.dilatation,
+        "loaded_by": file.loaded_by,
+    }
+
+
+def _of_specimen(
+    folder: Path, file: SceneFile, law: Law, source: Source
+) -> tuple[type[Specimen], Entries]:
+    """Return the fields of a specimen that its table, its tube and its grips give."""
+    for key in _OF_MESHES:
         if key in source.data:
             raise source.error("a specimen has none; it is held and moved by its table", (key,))
+    with source.at("tube", table=("tube",)):
+        if file.tube is not None and file.grips not in (None, "none"):
+            raise InputError("a tube is a specimen without grips")
+        tube = None if file.tube is None else Tube(**file.tube.model_dump())
     with source.at("specimen"):
         assert file.specimen is not None
-        mesh, supports, loads = body_of(read_states(folder / file.specimen, tube))
-    return Body(mesh), supports, loads
-
-
-def _tube(file: SceneFile) -> Tube | None:
-    """Return the sector of a tube."""
-    if file.tube is None:
-        return None
-    if file.specimen is None or file.grips not in (None, "none"):
-        raise InputError("a tube is a specimen without grips; give its table as 'specimen'")
-    return Tube(**file.tube.model_dump())
-
-
-def _grips(folder: Path, file: SceneFile) -> Grips | None:
-    """Return how the specimen was held, with what has been learned of its grips."""
-    if file.grips is None:
-        return None
-    if file.specimen is None:
-        raise InputError("only a specimen has grips; hold a mesh by [[supports]]")
-    if file.grips == "none":
-        return None
-    entries = file.grips.model_dump()
-    learned = entries.pop("learned")
-    return Grips(**entries, learned=Learned.read(folder / learned) if learned else None)
+        states = read_states(folder / file.specimen, tube)
+    entries: Entries = {"states": states, "tube": tube, "homogeneous": file.grips == "none"}
+    with source.at("fibres", table=("fibres",)):
+        if isinstance(file.fibres, Uniform):
+            fibres, sheets, angles = file.fibres.repeated(len(states.free))
+            sheets = sheets if law.sheets else None
+            entries |= {"fibres": fibres, "sheets": sheets, "angles": angles}
+        elif file.fibres is not None:
+            raise InputError(f"rule '{file.fibres.rule}' is for a mesh; a specimen has 'uniform'")
+    with source.at("grips", table=("grips",)):
+        if file.grips is not None and file.grips != "none":
+            of_grips = file.grips.model_dump()
+            learned = of_grips.pop("learned")
+            learned = Learned.read(folder / learned) if learned else None
+            entries["grips"] = Grips(**of_grips, learned=learned)
+    return Specimen, entries
 
 
 def _one_body(folder: Path, file: SceneFile, law: Law, source: Source) -> tuple[Body, Regions]:

@@ -12,6 +12,7 @@ from emulator.geometry.fibres import across
 from emulator.geometry.refinement import Refinement, refined
 from emulator.scenes.fibre_rules import FibreRule
 from emulator.scenes.scene import Scene
+from emulator.scenes.specimen import Specimen, with_mesh
 
 FINER = "finer"
 """The name under which the origin of a scene says that its mesh was refined."""
@@ -101,15 +102,15 @@ def _is_made_by(rule: FibreRule, scene: Scene) -> bool:
     return fibres.shape == scene.fibres.shape and np.allclose(fibres, scene.fibres, atol=1e-9)
 
 
-def wider(scene: Scene) -> Scene:
+def wider(scene: Scene | Specimen) -> Scene | Specimen:
     """Return ``scene`` with every parameter's range wider by half of it on each side."""
     parameters = tuple(parameter.wider() for parameter in scene.parameters)
     origin = {"scene": WIDER, "of": dict(scene.origin)} if scene.origin else {}
     return replace(scene, parameters=parameters, origin=origin)
 
 
-CHANGES: Mapping[str, Callable[[Scene], Scene]] = {
-    FINER: lambda scene: finer(scene).scene,
+CHANGES: Mapping[str, Callable[[Scene | Specimen], Scene | Specimen]] = {
+    FINER: lambda scene: finer(with_mesh(scene)).scene,
     WIDER: wider,
 }
 """What ``finer:SCENE`` and ``wider:SCENE`` are."""

@@ -28,7 +28,7 @@ from emulator.geometry.mesh import Mesh
 from emulator.scenes.grips import Grips
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
-from emulator.scenes.specimen import states_of
+from emulator.scenes.specimen import Specimen
 from emulator.scenes.states import AXES, States
 from emulator.scenes.supports.dirichlet import Support
 
@@ -44,14 +44,14 @@ class Piece:
 
     Parameters
     ----------
-    specimen : the scene of its homogeneous states.
+    specimen : its homogeneous states.
     grips : how it was held.
     faces : the axes whose upper face is moved.
     moved : the components (i, j): faces normal to j are displaced along i.
     largest : the largest of each of ``moved`` in any state, without sign.
     """
 
-    specimen: Scene
+    specimen: Specimen
     grips: Grips
     faces: tuple[int, ...]
     moved: tuple[tuple[int, int], ...]
@@ -232,7 +232,7 @@ def _hooks(face: str) -> str:
     return f"{face}.hooks"
 
 
-def pieces(specimen: Scene) -> dict[str, Piece]:
+def pieces(specimen: Specimen) -> dict[str, Piece]:
     """Return the gripped piece of each test of a specimen with grips, by the test's name.
 
     Tests that move the same faces in the same way have one piece.
@@ -240,10 +240,10 @@ def pieces(specimen: Scene) -> dict[str, Piece]:
     Raises
     ------
     InputError
-        A scene that is no specimen, a test that moves no face, faces that cannot be clamped at
+        A test that moves no face, faces that cannot be clamped at
         once, or directions that the piece cannot have.
     """
-    given, grips = states_of(specimen), specimen.grips
+    given, grips = specimen.states, specimen.grips
     assert grips is not None
     faces = {name: _faces(given, rows, grips) for name, rows in given.protocols.items()}
     by_pattern = dict[Any, Piece]()

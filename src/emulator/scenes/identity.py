@@ -5,16 +5,16 @@ ranges. Two scenes have equal solutions if their identities agree; a scene's *fi
 hashes its identity together with theta's order and box. Emulators and posteriors store the
 fingerprint and refuse a scene whose fingerprint differs.
 
-Every field of a scene is in its identity. Those of ``_FORMS`` have a canonical form of their own,
-those of ``_LEFT_OUT`` change no solution, and any other field, also one that is added later, is
-described entry by entry (:func:`described`) where it differs from its default.
+Every field of a scene is in its identity, and every field of a specimen. Those of ``_FORMS`` have a
+canonical form, those of ``_LEFT_OUT`` change no solution, and any other field, also one that is
+added later, is described entry by entry (:func:`described`) where it differs from its default.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from typing import Any
 
@@ -23,6 +23,7 @@ import numpy as np
 from emulator.geometry.discretisation import quadrature_points
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws.law import law_identity
+from emulator.scenes.forward_problem import ForwardProblem
 from emulator.scenes.scene_data import SceneData
 
 # Decimals that the fingerprint hashes, 1 nm of lengths in mm, so that round-off, which differs
@@ -100,12 +101,7 @@ def identity_of(scene: SceneData) -> Identity:
         "springs": sorted(json.dumps(spring) for spring in springs if spring is not None),
         "dilatation": scene.dilatation,
     }
-    for field in fields(SceneData):  # one at its default leaves the fingerprints of saved files
-        value = getattr(scene, field.name)
-        if field.name not in _FORMS | _LEFT_OUT and described(value) != described(_default(field)):
-            description[field.name] = described(value)
-    if scene.grips is not None:  # each test of a specimen, a node set, is a path of its grips
-        indices |= {f"nodes {name}": np.unique(nodes) for name, nodes in mesh.node_sets.items()}
+    description |= described_fields(scene, _FORMS)
     displacements = {f"displacement per unit of {name}": d for name, d in per_unit.items()}
     return Identity(
         lengths={"nodes": mesh.nodes, "displacement": fixed, **displacements},
@@ -119,8 +115,24 @@ def identity_of(scene: SceneData) -> Identity:
     )
 
 
-def fingerprint(scene: SceneData, identity: Identity) -> str:
-    """Return a short hash of the scene's identity and of the order and the box of theta."""
+def described_fields(problem: Any, forms: Collection[str]) -> dict[str, Any]:
+    """Return the description of each field but those in ``forms`` and those of no consequence.
+
+    A field at its default is left out, which leaves the fingerprints of saved files.
+
+    problem : the scene or the specimen, a dataclass.
+    """
+    description = {}
+    for field in fields(problem):
+        if field.name not in _LEFT_OUT.union(forms):
+            value = described(getattr(problem, field.name))
+            if value != described(_default(field)):
+                description[field.name] = value
+    return description
+
+
+def fingerprint(problem: ForwardProblem, identity: Identity) -> str:
+    """Return a short hash of the problem's identity and of the order and the box of theta."""
     content = [_text(dict(identity.description))]
     # Adding 0.0 turns the -0.0 that rounding leaves into 0.0.
     for name, values in sorted({**identity.lengths, **identity.directions}.items()):
@@ -128,7 +140,7 @@ def fingerprint(scene: SceneData, identity: Identity) -> str:
     for name, values in sorted(identity.indices.items()):
         content += [name.encode(), values.astype(np.int64).tobytes()]
     content.append(
-        _text([[p.name, float(p.low), float(p.high), p.scale] for p in scene.parameters])
+        _text([[p.name, float(p.low), float(p.high), p.scale] for p in problem.parameters])
     )
     digest = hashlib.sha256()
     for part in content:

@@ -1,7 +1,7 @@
 """A scene: geometry, law, loads, supports and parameters of one problem.
 
 :class:`~emulator.scenes.scene_data.SceneData` is all that a user says. :class:`Scene` adds what
-follows from it, by topic: theta, discretisation, tissue, prescribed displacements and identity.
+follows from it, by topic: discretisation, tissue, prescribed displacements and identity.
 """
 
 from __future__ import annotations
@@ -14,18 +14,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.core.display import TableRepr
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import (
     Blocks,
     Discretisation,
     discretise,
     patchwise,
-    quadrature_points,
 )
 from emulator.geometry.facets import Cavity, encloses
+from emulator.scenes.forward_problem import ForwardProblem
 from emulator.scenes.identity import Identity, fingerprint, identity_of
-from emulator.scenes.parameter_space import ParameterSpace
 from emulator.scenes.scene_data import SceneData
 from emulator.scenes.tissue import Fibres, Tissue, at_every_point, stiffness_of, turned
 
@@ -34,53 +32,17 @@ ENDOCARDIUM = "endocardium"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Scene(SceneData, TableRepr):
+class Scene(SceneData):
     """Geometry, law, loads, supports and parameters of one problem, and what follows from them.
 
     The fields are listed in :class:`~emulator.scenes.scene_data.SceneData`. They are checked, and
     frozen, arrays included, so that compiled functions of the scene never go stale.
     """
 
-    # Theta: the parameters, in their box.
-
-    @cached_property
-    def space(self) -> ParameterSpace:
-        """The box that theta lies in."""
-        return ParameterSpace(self.parameters)
-
     @property
-    def parameter_names(self) -> tuple[str, ...]:
-        """Names of the entries of theta, in order."""
-        return self.space.names
-
-    @property
-    def centre(self) -> jax.Array:
-        """Theta in the middle of its box, on each parameter's scale, shape (p,)."""
-        return self.space.centre
-
-    def theta(self, **values: float) -> jax.Array:
-        """Return theta (p,) from named values in the parameters' units.
-
-        Raises
-        ------
-        InputError
-            Unknown, missing or out-of-range value.
-        """
-        return self.space.theta(values, f"scene '{self.name}'")
-
-    def to_unit(self, theta: jax.Array) -> jax.Array:
-        """Return the positions in the box of theta (..., p), 0 to 1 inside."""
-        return self.space.to_unit(theta)
-
-    def from_unit(self, position: jax.Array) -> jax.Array:
-        """Return theta (..., p) from positions: the inverse of :meth:`to_unit`."""
-        return self.space.from_unit(position)
-
-    def resolve(self, theta: jax.Array) -> dict[str, jax.Array]:
-        """Return every parameter and constant by name, at theta (p,)."""
-        values: dict[str, Any] = dict(self.constants)
-        values.update({name: theta[k] for k, name in enumerate(self.parameter_names)})
-        return values
+    def node_count(self) -> int:
+        """The number of nodes of the mesh."""
+        return len(self.mesh.nodes)
 
     # Discretisation.
 
@@ -101,7 +63,7 @@ class Scene(SceneData, TableRepr):
         """Unit fibre directions at the quadrature points, (m, q, 3); of a scene with fibres."""
         if self.fibres is None:
             raise InputError(f"scene '{self.name}' has no fibres")
-        return at_every_point(self.fibres, self.mesh.order)
+        return at_every_point(self.fibres, self.point_count)
 
     @property
     def fibres_of_loads(self) -> Fibres | None:
@@ -119,8 +81,7 @@ class Scene(SceneData, TableRepr):
             directions = turned(directions, self.angles, values)
         stiffness = stiffness_of(self.regions, self.stiffness_modes, values)
         if stiffness is not None:
-            points = len(quadrature_points(self.mesh.order))
-            stiffness = jnp.broadcast_to(stiffness[:, None], (len(stiffness), points))
+            stiffness = jnp.broadcast_to(stiffness[:, None], (len(stiffness), self.point_count))
         return Tissue(directions, stiffness)
 
     def block_tissue_at(self, theta: jax.Array) -> Tissue:
@@ -132,10 +93,11 @@ class Scene(SceneData, TableRepr):
     @cached_property
     def _tissue(self) -> Tissue:
         # NumPy arrays: JAX arrays made inside jit would be tracers, and a scene keeps these.
-        order = self.mesh.order
         directions = self.fibres_at_points if self.law.fibres else None
         if directions is not None and self.sheets is not None:
-            directions = np.stack([directions, at_every_point(self.sheets, order)], axis=2)
+            directions = np.stack(
+                [directions, at_every_point(self.sheets, self.point_count)], axis=2
+            )
         return Tissue(cast(Any, directions))
 
     @cached_property
@@ -200,31 +162,31 @@ class Scene(SceneData, TableRepr):
         order = "linear" if mesh.order == 1 else "quadratic"
         if (mesh.order, self.dilatation) != (1, "pointwise"):
             order = f"{order}, {self.dilatation} dilatation"
-        ranges = [f"{p.name} {p.low:.4g} to {p.high:.4g} {p.unit}".strip() for p in self.parameters]
+        law, theta = self._summary_of_law()
         return f"Scene '{self.name}'", [
             ("mesh", f"{len(mesh.nodes)} nodes, {len(mesh.elements)} tetrahedra, {order}"),
-            ("law", self.law.name),
+            law,
             ("loads", ", ".join(load.kind for load in self.loads) or "none"),
             ("supports", ", ".join(support.kind for support in self.supports)),
-            ("theta", ", ".join(ranges)),
+            theta,
         ]
 
 
-def all_nodes(scene: Scene) -> np.ndarray:
-    """Return the number of every node of the scene, (n,)."""
-    return np.arange(len(scene.mesh.nodes))
+def all_nodes(problem: ForwardProblem) -> np.ndarray:
+    """Return the number of every node of a scene or a specimen, (n,)."""
+    return np.arange(problem.node_count)
 
 
-def check_nodes(scene: Scene, nodes: np.ndarray) -> np.ndarray:
-    """Return ``nodes`` as integers; refuse any that is no node of the scene."""
+def check_nodes(problem: ForwardProblem, nodes: np.ndarray) -> np.ndarray:
+    """Return ``nodes`` as integers; refuse any that is no node of the scene or specimen."""
     nodes = np.atleast_1d(np.asarray(nodes))
     if nodes.size == 0 or not np.issubdtype(nodes.dtype, np.integer):
         raise InputError("observed nodes must be a list of whole numbers, not empty")
-    unknown = nodes[(nodes < 0) | (nodes >= len(scene.mesh.nodes))]
+    unknown = nodes[(nodes < 0) | (nodes >= problem.node_count)]
     if unknown.size:
         raise InputError(
-            f"node {unknown[0]} is unknown; scene '{scene.name}' has nodes 0 to "
-            f"{len(scene.mesh.nodes) - 1}"
+            f"node {unknown[0]} is unknown; scene '{problem.name}' has nodes 0 to "
+            f"{problem.node_count - 1}"
         )
     return nodes
 
@@ -234,8 +196,8 @@ def check_nodes(scene: Scene, nodes: np.ndarray) -> np.ndarray:
 
 def cavity_sets(scene: Scene) -> tuple[str, ...]:
     """Return the facet sets that enclose a volume: sets under pressure, and ``endocardium``."""
-    pressed = [load.pressed for load in scene.loads if load.pressed is not None]
     endocardium = [ENDOCARDIUM] if ENDOCARDIUM in scene.mesh.facet_sets else []
+    pressed = [load.pressed for load in scene.loads if load.pressed is not None]
     names = dict.fromkeys([*pressed, *endocardium])
     return tuple(name for name in names if encloses(scene.mesh, name))
 

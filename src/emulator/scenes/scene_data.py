@@ -5,40 +5,36 @@ Each parameter has an owner, directions have readers, and the body is fixed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, Literal, get_args
+from typing import Any, Literal, get_args, override
 
 import numpy as np
 
 from emulator.core.errors import InputError
-from emulator.geometry.fibres import check_across, checked_directions
+from emulator.geometry.discretisation import quadrature_points
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws import Law
-from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.fibre_rules import FibreRule
-from emulator.scenes.grips import Grips
+from emulator.scenes.forward_problem import ForwardProblem, Owners, add_owners
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.part import BoundaryCondition, Load, Prescribed
 from emulator.scenes.supports.dirichlet import check_motions, prescribe
 from emulator.scenes.tissue import (
     FibreAngles,
-    at_every_point,
     checked_modes,
     checked_regions,
-    effective_angles,
     stiffness_quantities,
 )
-from emulator.scenes.tube import Tube
 
 Dilatation = Literal["pointwise", "mean", "patch"]
 """The part of a body that shares a volume change: a point, an element, or a patch of elements."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SceneData:
+class SceneData(ForwardProblem):
     """The description of one problem: geometry, law, loads, supports and parameters.
 
     Parameters
@@ -73,10 +69,6 @@ class SceneData:
         load parameter of theta the name of the parameter or constant that holds its value there,
         ``{"pressure": "imaged"}``. A simulator then unloads and loads
         (:mod:`emulator.fem.loaded`), and displacements are those from the mesh.
-    grips : how a specimen was held (:mod:`emulator.scenes.gripped`).
-    homogeneous : whether somebody said that a specimen without ``grips`` deforms evenly. It
-        changes no solution: verdicts name the assumption, and by whom it is made.
-    tube : the sector that a specimen's states are points of (:mod:`emulator.scenes.tube`).
     """
 
     name: str
@@ -94,10 +86,7 @@ class SceneData:
     fibre_rule: FibreRule | None = None
     angles: tuple[FibreAngles, ...] = ()
     loaded_by: Mapping[str, str] = field(default_factory=dict)
-    grips: Grips | None = None
-    tube: Tube | None = None
     stiffness_modes: np.ndarray | None = None
-    homogeneous: bool = False
 
     def __post_init__(self) -> None:
         for name in ("constants", "origin", "loaded_by"):
@@ -107,8 +96,6 @@ class SceneData:
             prescribed = self.prescribed  # refuses supports that contradict one another
             self._check_parameters()
             self._check_dilatation()
-            if not self.parameters:
-                raise InputError("no parameter varies, nothing to calibrate")
             if not self.supports:
                 raise InputError("no support, the body could move freely")
             check_motions(self.mesh, self.supports)
@@ -120,13 +107,6 @@ class SceneData:
             for load in self.loads:
                 load.check(self.mesh, prescribed)
             self._check_image()
-            if self.grips is not None and self.homogeneous:
-                raise InputError("it has grips, and is said to deform evenly; say one of the two")
-            if self.grips is not None and self.loads:
-                raise InputError(
-                    "grips move a specimen; with applied stresses they are not supported: leave "
-                    "out one of the two"
-                )
         except InputError as error:
             raise InputError(f"scene '{self.name}': {error}") from error
 
@@ -136,6 +116,11 @@ class SceneData:
         return prescribe(self.mesh, self.supports)
 
     @property
+    def point_count(self) -> int:
+        """The number of quadrature points of an element."""
+        return len(quadrature_points(self.mesh.order))
+
+    @property
     def load_parameters(self) -> tuple[str, ...]:
         """Entries of theta that belong to loads or move supports; the others are the body's."""
         own = (load for load in self.loads if not load.shared)
@@ -143,36 +128,17 @@ class SceneData:
         names |= set(self.prescribed.per_unit)
         return tuple(parameter.name for parameter in self.parameters if parameter.name in names)
 
-    @property
-    def quantities(self) -> dict[str, Quantity]:
-        """Every parameter that law, loads, supports and regions take, by name."""
-        return {name: quantity for name, (quantity, _) in self._owners().items()}
-
-    def _owners(self) -> dict[str, tuple[Quantity, str]]:
+    @override
+    def _owners(self) -> Owners:
         """Return every parameter and its owner in words; loads may share one, and so may supports.
 
-        Raises
-        ------
-        InputError
-            Two owners of different kinds have a parameter of one name, or ``loaded_by`` names a
-            parameter that no load has.
+        :class:`InputError`, too, where ``loaded_by`` names a parameter that no load has.
         """
-        owners = {q.name: (q, f"law '{self.law.name}'") for q in self.law.quantities}
-        owners |= {q.name: (q, "a region") for q in stiffness_quantities(self.regions, None)}
+        owners = super()._owners()
         of_modes = stiffness_quantities(None, self.stiffness_modes)
         owners |= {q.name: (q, "a mode of stiffness") for q in of_modes}
-        groups = (("the fibres'", self.angles), ("load", self.loads), ("support", self.supports))
-        for noun, parts in groups:
-            of_other_kinds = set(owners)
-            for part in parts:
-                owner = f"{noun} {type(part).__name__}"
-                for quantity in part.quantities:
-                    if quantity.name in of_other_kinds:
-                        raise InputError(
-                            f"{owner} and {owners[quantity.name][1]} both have a parameter "
-                            f"'{quantity.name}'; call the {noun}'s by another name"
-                        )
-                    owners.setdefault(quantity.name, (quantity, owner))
+        add_owners(owners, "load", self.loads)
+        add_owners(owners, "support", self.supports)
         of_loads = {quantity.name: quantity for load in self.loads for quantity in load.quantities}
         for load, image in self.loaded_by.items():
             if load not in of_loads:
@@ -185,54 +151,16 @@ class SceneData:
         return owners
 
     def _check_tissue(self) -> None:
-        """Refuse regions, directions and angles that do not fit; keep them as frozen arrays."""
-        mesh, tissue = self.mesh, dict[str, Any](fibres=None, sheets=None)
+        """Refuse regions, modes and directions that do not fit; keep them as frozen arrays."""
+        mesh, tissue = self.mesh, dict[str, np.ndarray]()
         if self.regions is not None:
             tissue["regions"] = checked_regions(self.regions, len(mesh.elements), self.law)
         if self.stiffness_modes is not None:
             modes = checked_modes(self.stiffness_modes, len(mesh.elements), self.law)
             tissue["stiffness_modes"] = modes
-        for kind, reader in directions_read(self.law, self.loads).items():
-            directions = getattr(self, kind)
-            if directions is None and reader is not None:
-                raise InputError(f"{reader} needs {kind}")
-            if directions is not None and reader is None:
-                raise InputError(f"law '{self.law.name}' takes no {kind}")
-            if directions is not None:
-                tissue[kind] = checked_directions(directions, mesh, kind)
-        fibres, sheets = tissue["fibres"], tissue["sheets"]
-        if self.angles and fibres is None:
-            raise InputError("fibre angles turn fibres, and it has none")
-        tissue["angles"] = tuple(rotation.checked(mesh) for rotation in self.angles)
-        if len(effective_angles(tissue["angles"], fibres, sheets)) < len(self.angles):
-            raise InputError("sheet angles turn sheets, and its law takes none")
-        if fibres is not None and sheets is not None:
-            check_across(at_every_point(sheets, mesh.order), at_every_point(fibres, mesh.order))
         for name, value in tissue.items():
             object.__setattr__(self, name, value)
-
-    def _check_parameters(self) -> None:
-        """Refuse unknown, repeated or missing names, and inadmissible units or values."""
-        owners = self._owners()
-        names = [*(parameter.name for parameter in self.parameters), *self.constants]
-        for name in names:
-            if name not in owners:
-                raise InputError(
-                    f"parameter '{name}' is not one of law '{self.law.name}', its loads and "
-                    f"supports: {', '.join(owners)}"
-                )
-            if names.count(name) > 1:
-                raise InputError(f"parameter '{name}' is given twice")
-        for name, (_, owner) in owners.items():
-            if name not in names:
-                raise InputError(f"{owner} needs '{name}'")
-        faults = [owners[name][0].value_fault(value) for name, value in self.constants.items()]
-        for parameter in self.parameters:
-            quantity, owner = owners[parameter.name]
-            faults.append(quantity.unit_fault(parameter.unit, owner))
-            faults.append(quantity.range_fault(parameter.low, parameter.high))
-        for fault in filter(None, faults):
-            raise InputError(fault)
+        self._check_directions(len(mesh.elements), self.point_count, self.loads)
 
     def _check_dilatation(self) -> None:
         """Refuse an unknown ``dilatation``, or one that the elements do not have."""
@@ -267,13 +195,3 @@ class SceneData:
                     f"loaded_by: '{name}' is a constant, so the mesh is loaded by it anyway; "
                     "leave it out, or make it a parameter"
                 )
-
-
-def directions_read(law: Law, loads: Sequence[Load]) -> dict[str, str | None]:
-    """Return the first reader of ``fibres`` and of ``sheets``, in words; None without a reader."""
-    readers = [f"law '{law.name}'"] if law.fibres else []
-    readers += [f"load '{load.kind}'" for load in loads if load.fibres]
-    return {
-        "fibres": readers[0] if readers else None,
-        "sheets": f"law '{law.name}'" if law.sheets else None,
-    }

@@ -1,65 +1,145 @@
 r"""Specimens: pieces of tissue in a testing machine, in homogeneous states.
 
-Uniaxial, biaxial and shear tests deform the middle of a piece evenly. A specimen is a scene with
-one tetrahedron of corners :math:`0, e_x, e_y, e_z` (mm) for each state of
-:mod:`emulator.scenes.states`, or for each point of a tube's wall in each state
-(:mod:`emulator.scenes.tube`): node k moves by column k of H, and FEM of it is exact. Supports hold
-what is prescribed. A pull P along axis i is a dead force on corner :math:`e_i`, whose work
-:math:`V P H_{ii}` in the volume V of 1/6 mm3 makes it P/6 mN.
+Uniaxial, biaxial and shear tests deform the middle of a piece evenly, and so does each point of an
+inflated tube's wall. A specimen is a law and the states (:mod:`emulator.scenes.states`) whose
+stresses follow from it. It has no mesh: where a forward map gives displacements, those of a
+specimen are the columns of the gradient H of each state, :math:`u = H e_k`, the displacements of
+the corners :math:`e_x, e_y, e_z` (mm) of a unit cube.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.cells import PROTOCOL, read_cells
 from emulator.core.errors import InputError
 from emulator.geometry.mesh import Mesh
-from emulator.scenes.loads.force import MN_PER_N, Force
+from emulator.mechanics.laws import Law
+from emulator.mechanics.laws.law import law_identity
+from emulator.scenes.fibre_rules import FibreRule
+from emulator.scenes.forward_problem import ForwardProblem
+from emulator.scenes.grips import Grips
+from emulator.scenes.identity import Identity, described_fields, fingerprint
+from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
-from emulator.scenes.states import AXES, States, motion_columns, pull_columns, states, with_unit
-from emulator.scenes.supports.dirichlet import Support
+from emulator.scenes.states import States, motion_columns, pull_columns, states, with_unit
+from emulator.scenes.tissue import FibreAngles, Tissue, stiffness_of, turned
 from emulator.scenes.tube import Tube
 from emulator.scenes.tube import motion_columns as tube_columns
 
-_APART = 2.0  # mm between the tetrahedra of two states
-_VOLUME = 1.0 / 6.0  # mm3, of a tetrahedron
 _CONVENTION = re.compile(r"(lambda|λ|sigma|σ)_?([xyzXYZ]{1,2})")
-_CORNER = "corner."  # before the names of the sets that are held or pulled; other sets are tests
 
 
-def body_of(given: States) -> tuple[Mesh, tuple[Support, ...], tuple[Force, ...]]:
-    """Return the tetrahedra of states side by side, the supports that prescribe them, and pulls.
+@dataclass(frozen=True, eq=False, repr=False)
+class Specimen(ForwardProblem):
+    """The states of a tested piece of tissue, and the law that its stresses follow from.
 
-    Sets are ``corner.origin``, ``corner.x`` and so on, and each test by its name.
+    Parameters
+    ----------
+    name : used in messages and reports.
+    states : the states that are prescribed, m of them; of a tube, those of its wall's points.
+    law : hyperelastic law.
+    parameters : entries of theta, in order.
+    constants : parameters of the law that do not vary.
+    fibres, sheets : unit directions of each state (m, 3), or of all (3,), for laws that read them.
+    origin : the file that the specimen was read from, as a scene's.
+    fibre_rule : the rule by which the directions were made.
+    angles : parameters that turn fibres and sheets, as a scene's.
+    tube : the sector whose wall's points the states are (:mod:`emulator.scenes.tube`). With several
+        layers, region k is layer k from the inside.
+    grips : how the piece was held (:mod:`emulator.scenes.gripped`).
+    homogeneous : whether somebody said that a piece without ``grips`` deforms evenly. It changes no
+        solution: verdicts name the assumption, and by whom it is made.
     """
-    H, free, pulls, protocols = given
-    count = len(H)
-    side = int(np.ceil(count ** (1.0 / 3.0)))
-    places = np.stack(np.unravel_index(np.arange(count), (side, side, side)), axis=1)
-    corners = np.vstack([np.zeros(3), np.eye(3)])
-    nodes = (_APART * places[:, None] + corners).reshape(-1, 3)
-    elements = np.arange(4 * count).reshape(count, 4)
-    sets = {f"{_CORNER}origin": elements[:, 0]}
-    supports, forces = [Support(f"{_CORNER}origin")], list[Force]()
-    for k, axis in enumerate(AXES):
-        name, held = f"{_CORNER}{axis}", np.flatnonzero(~free[:, k])
-        sets[name] = elements[:, k + 1]
-        supports.append(Support(name, H[:, :, k], components=AXES.replace(axis, "")))
-        if len(held):
-            sets[f"{name}.held"] = elements[held, k + 1]
-            supports.append(Support(f"{name}.held", H[held, :, k], components=axis))
-        if len(pulled := np.flatnonzero(pulls[:, k])):
-            sets[f"{name}.pulled"] = elements[pulled, k + 1]
-            along = _VOLUME / MN_PER_N * pulls[pulled, k, None] * np.eye(3)[k]
-            forces.append(Force(f"{name}.pulled", along))
-    tests = {name: elements[rows].ravel() for name, rows in protocols.items() if name}
-    return Mesh(nodes, elements, {**tests, **sets}), tuple(supports), tuple(forces)
+
+    name: str
+    states: States
+    law: Law
+    parameters: tuple[Parameter, ...]
+    constants: Mapping[str, float] = field(default_factory=dict)
+    fibres: np.ndarray | None = None
+    sheets: np.ndarray | None = None
+    origin: Mapping[str, Any] = field(default_factory=dict)
+    fibre_rule: FibreRule | None = None
+    angles: tuple[FibreAngles, ...] = ()
+    tube: Tube | None = None
+    grips: Grips | None = None
+    homogeneous: bool = False
+
+    def __post_init__(self) -> None:
+        count = len(self.states.free)
+        for name in ("constants", "origin"):
+            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+        for name in ("fibres", "sheets"):
+            if np.shape(getattr(self, name)) == (3,):
+                object.__setattr__(self, name, np.tile(getattr(self, name), (count, 1)))
+        if self.tube is not None:
+            object.__setattr__(self, "regions", self.tube.regions(count))
+        try:
+            self._check_directions(count, 1)
+            self._check_parameters()
+            if self.grips is not None and self.homogeneous:
+                raise InputError("it has grips, and is said to deform evenly; say one of the two")
+            if self.grips is not None and self.states.pulls.any():
+                raise InputError(
+                    "grips move a specimen; with applied stresses they are not supported: leave "
+                    "out one of the two"
+                )
+        except InputError as error:
+            raise InputError(f"scene '{self.name}': {error}") from error
+
+    @cached_property
+    def measured(self) -> States:
+        """A state for each measured one: of a tube, that of the innermost point of the wall."""
+        H, free, pulls, tests = self.states
+        points = 1 if self.tube is None else self.tube.size
+        rows = {name: of_test[::points] // points for name, of_test in tests.items()}
+        return States(H[::points], free[::points], pulls[::points], rows)
+
+    @property
+    def node_count(self) -> int:
+        """Three for each state: the corners of its unit cube."""
+        return 3 * len(self.states.free)
+
+    @property
+    def mesh(self) -> Mesh:
+        """There is none: :class:`InputError` for what needs one, such as a place or a picture."""
+        return with_mesh(self).mesh
+
+    def gradients(self, u: jax.Array) -> jax.Array:
+        """Return the gradients H (m, 3, 3) from the displacements (3 m, 3) of the unit cubes."""
+        return jnp.swapaxes(u.reshape(-1, 3, 3), 1, 2)
+
+    def tissue_at(self, theta: jax.Array) -> Tissue:
+        """Return material data at ``theta`` (p,), stacked over the states, (m, ...)."""
+        values, directions = self.resolve(theta), self.fibres
+        if directions is not None:
+            if self.sheets is not None:
+                directions = np.stack([directions, self.sheets], axis=1)
+            directions = turned(directions[:, None], self.angles, values)[:, 0]
+        return Tissue(directions, stiffness_of(self.regions, None, values))
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Short hash of states, law, tissue, tube and grips, and of the order and box of theta."""
+        description = {"law": law_identity(self.law)}
+        description |= described_fields(self, ("law", "parameters"))
+        return fingerprint(self, Identity({}, {}, {}, description))
+
+    def summary_rows(self) -> tuple[str, list[tuple[str, str]]]:
+        """Return the title, and rows of states, law and theta."""
+        count = f"{len(self.measured.free)} in {len(self.states.protocols)} tests"
+        return f"Specimen '{self.name}'", [("states", count), *self._summary_of_law()]
 
 
 def specimen(
@@ -68,28 +148,36 @@ def specimen(
     ordered: bool = True,
     tube: Tube | None = None,
     **entries: Any,
-) -> Scene:
-    """Return the scene of a specimen.
+) -> Specimen:
+    """Return a specimen.
 
     Parameters
     ----------
     given : its states, or the columns (m,) of :func:`~emulator.scenes.states.states`, of one test.
     ordered : see there.
-    tube : the sector of a tube whose motion ``given`` is, see :mod:`emulator.scenes.tube`. With
-        several layers, region k of the scene is layer k, from the inside.
-    entries : the fields of a :class:`Scene` besides mesh, supports and pulls; fibres and sheets may
-        be one direction (3,).
+    tube : the sector of a tube whose motion ``given`` is, see :mod:`emulator.scenes.tube`.
+    entries : the other fields of a :class:`Specimen`.
     """
     if not isinstance(given, States):
         given = states_in(given, tube=tube, ordered=ordered)
-    mesh, supports, pulls = body_of(given)
-    for name in ("fibres", "sheets"):
-        if entries.get(name) is not None:
-            entries[name] = np.broadcast_to(entries[name], (len(mesh.elements), 3))
-    if tube is not None:
-        entries |= {"tube": tube, "regions": tube.regions(len(mesh.elements))}
-    entries["loads"] = (*pulls, *entries.get("loads", ()))
-    return Scene(mesh=mesh, supports=supports, **{"name": "specimen", **entries})
+    return Specimen(states=given, tube=tube, **{"name": "specimen", **entries})
+
+
+def require_specimen(problem: ForwardProblem) -> Specimen:
+    """Return ``problem`` if it is a specimen; :class:`InputError` for a scene."""
+    if not isinstance(problem, Specimen):
+        raise InputError(f"scene '{problem.name}' is no specimen: give a table of its states")
+    return problem
+
+
+def with_mesh(problem: ForwardProblem) -> Scene:
+    """Return ``problem`` if it is a scene; :class:`InputError` for a specimen."""
+    if not isinstance(problem, Scene):
+        raise InputError(
+            f"scene '{problem.name}' is a specimen, which has no mesh; em.homogeneous solves it, "
+            "and simulate, infer, certify and report take it"
+        )
+    return problem
 
 
 def states_in(
@@ -145,55 +233,3 @@ def _likely(words: Sequence[str]) -> str:
             own = "stretch" if found[1] in ("lambda", "λ") else "cauchy"
             renamed.append(f"{word} {own}_{found[2][0].lower()}{f' [{unit}]' if unit else ''}")
     return f"; call {', '.join(renamed)} if they are that" if renamed else ""
-
-
-def is_specimen(scene: Scene) -> bool:
-    """Return whether each element is a body of its own, so that its state is homogeneous."""
-    return scene.mesh.order == 1 and len(scene.mesh.nodes) == scene.mesh.elements.size
-
-
-def states_of(scene: Scene) -> States:
-    """Return the states of a specimen's scene, whose supports prescribe them by numbers.
-
-    :class:`InputError` for a scene that is no specimen, or has loads besides pulls.
-    """
-    if not is_specimen(scene) or scene.prescribed.per_unit:
-        raise InputError(f"scene '{scene.name}' is no specimen: its elements share nodes")
-    corners = scene.mesh.elements[:, 1:]
-    edges = scene.mesh.nodes[corners] - scene.mesh.nodes[scene.mesh.elements[:, :1]]
-    if not np.array_equal(edges, np.broadcast_to(np.eye(3), edges.shape)):
-        raise InputError(f"scene '{scene.name}' is no specimen: its elements have other corners")
-    H = np.swapaxes(scene.held_displacement[corners], 1, 2)
-    free = ~np.stack([scene.held[corners[:, k], k] for k in range(3)], axis=1)
-    owner = np.repeat(np.arange(len(corners)), 4)
-    order = np.argsort(scene.mesh.elements.ravel())
-    of_node = owner[order]
-    tests = {
-        name: np.unique(of_node[nodes])
-        for name, nodes in scene.mesh.node_sets.items()
-        if not name.startswith(_CORNER)
-    }
-    return States(H, free, _pulls(scene, corners, free), tests or {"": np.arange(len(corners))})
-
-
-def _pulls(scene: Scene, corners: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Return the pulls (m, 3) in kPa: known dead forces on free corners (m, 3) along their axes."""
-    forces, pulls = np.zeros(scene.mesh.nodes.shape), np.zeros(free.shape)
-    for load in scene.loads:
-        own = load.dead_forces(scene.discretisation)
-        forces += own.get(None, 0.0)
-        pulls = np.where(free, forces[corners, range(3)], 0.0) / _VOLUME
-        if own.keys() != {None} or np.count_nonzero(forces) > np.count_nonzero(pulls):
-            raise InputError(f"scene '{scene.name}': a specimen has no loads but pulls")
-    return pulls
-
-
-def measured_states(scene: Scene) -> States:
-    """Return a state for each measured one: of a tube, that of the innermost point of the wall.
-
-    :class:`InputError` for a scene that is no specimen.
-    """
-    H, free, pulls, tests = states_of(scene)
-    each = 1 if scene.tube is None else scene.tube.size
-    measured = {name: rows[::each] // each for name, rows in tests.items()}
-    return States(H[::each], free[::each], pulls[::each], measured)

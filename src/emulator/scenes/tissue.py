@@ -36,9 +36,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.errors import InputError
-from emulator.geometry.discretisation import quadrature_points
 from emulator.geometry.fibres import checked_directions
-from emulator.geometry.mesh import Mesh, frozen_array
+from emulator.geometry.mesh import frozen_array
 from emulator.mechanics.laws.law import Law, Quantity, number
 
 Values = Mapping[str, jax.Array]
@@ -56,9 +55,8 @@ class Tissue(NamedTuple):
     stiffness: jax.Array | None = None
 
 
-def at_every_point(directions: np.ndarray, order: int) -> np.ndarray:
-    """Return directions (m, 3) or (m, q, 3) at all points of elements of ``order``, (m, q, 3)."""
-    points = len(quadrature_points(order))
+def at_every_point(directions: np.ndarray, points: int) -> np.ndarray:
+    """Return directions (m, 3) or (m, q, 3) at all q ``points`` of the elements, (m, q, 3)."""
     if directions.shape[1:] == (points, 3):
         return directions
     return np.broadcast_to(directions[:, None], (len(directions), points, 3))
@@ -154,17 +152,16 @@ class FibreAngles:
         """The parameters, angles in degrees."""
         return tuple(Quantity(name, "deg", -360.0, 360.0) for name in self.shares)
 
-    def checked(self, mesh: Mesh) -> FibreAngles:
-        """Return the same rotation with frozen arrays (m, q, ...).
+    def checked(self, count: int, points: int) -> FibreAngles:
+        """Return the same rotation with frozen arrays (m, q, ...) of m elements of q points.
 
         Raises
         ------
         InputError
-            Arrays do not fit the elements of ``mesh``, axes are no unit vectors, or shares are not
-            finite.
+            Arrays do not fit the elements, axes are no unit vectors, or shares are not finite.
         """
-        axis = checked_directions(self.axis, mesh, "axes of fibre angles")
-        wide = (len(mesh.elements), len(quadrature_points(mesh.order)))
+        axis = checked_directions(self.axis, count, points, "axes of fibre angles")
+        wide = (count, points)
         shares = {}
         for name, values in self.shares.items():
             share = np.asarray(values, dtype=float)
@@ -175,7 +172,7 @@ class FibreAngles:
                     f"expected {wide[:1]} or {wide}"
                 )
             shares[name] = frozen_array(np.broadcast_to(share, wide))
-        return FibreAngles(frozen_array(at_every_point(axis, mesh.order)), shares)
+        return FibreAngles(frozen_array(at_every_point(axis, points)), shares)
 
 
 # So that loads can hand their fibres to JAX, which takes them element by element.

@@ -23,6 +23,7 @@ from emulator.fem.assembly import System
 from emulator.fem.energy import volume_ratio
 from emulator.fem.simulator import Simulator
 from emulator.scenes.scene import Scene, all_nodes, check_nodes
+from emulator.scenes.specimen import with_mesh
 from emulator.surrogates.emulator import EMULATOR
 from emulator.surrogates.protocol import (
     ForwardKind,
@@ -61,7 +62,7 @@ class CorrectedForward:
     @property
     def scene(self) -> Scene:
         """The scene whose displacement is predicted."""
-        return self.base.scene
+        return with_mesh(self.base.scene)
 
     @cached_property
     def fingerprint(self) -> str:
@@ -118,7 +119,7 @@ class CorrectedForward:
 
 def corrected(base: ForwardMap, simulator: Simulator, steps: int = 1) -> CorrectedForward:
     """Return ``base``, a map over all nodes, corrected by ``steps`` Newton steps."""
-    if len(base.nodes) != len(base.scene.mesh.nodes):
+    if len(base.nodes) != base.scene.node_count:
         raise InputError("correction needs a forward map over all nodes")
     if steps < 1:
         raise InputError(f"correction: {steps} Newton steps; give 1 or more")
@@ -126,7 +127,7 @@ def corrected(base: ForwardMap, simulator: Simulator, steps: int = 1) -> Correct
 
 
 def _build(ingredients: Ingredients, options: Options) -> ForwardMap:
-    return corrected(EMULATOR.build(ingredients, {}), ingredients.simulator, options["steps"])
+    return corrected(EMULATOR.build(ingredients, {}), ingredients.fem, options["steps"])
 
 
 CORRECTED = ForwardKind(

@@ -34,6 +34,7 @@ from emulator.core.errors import InputError, look_up
 from emulator.core.store import inside, read_arrays, read_json, save_arrays, write_json
 from emulator.fem.reactions import SupportForce
 from emulator.scenes.scene import Scene, all_nodes, check_nodes
+from emulator.scenes.specimen import with_mesh
 from emulator.surrogates.coarse import Coarse
 from emulator.surrogates.discrepancy import Discrepancy
 from emulator.surrogates.network import Network
@@ -335,8 +336,8 @@ def load(name: str | Path, scene: Scene | None = None) -> Emulator:
 
 
 def _build(ingredients: Ingredients, _: Options) -> ForwardMap:
-    name = ingredients.scene.name if ingredients.emulator is None else ingredients.emulator
-    return load(name, ingredients.scene).cache()
+    scene = with_mesh(ingredients.scene)
+    return load(ingredients.emulator or scene.name, scene).cache()
 
 
 EMULATOR = ForwardKind(

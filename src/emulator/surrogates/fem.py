@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,9 @@ import numpy as np
 from emulator.core.store import to_json
 from emulator.fem.campaign import Row, Solver, solve_rows
 from emulator.fem.simulator import Simulator
+from emulator.fem.solution import EquilibriumSolver
 from emulator.scenes.scene import Scene, all_nodes, check_nodes
+from emulator.surrogates.homogeneous import Homogeneous
 from emulator.surrogates.protocol import ForwardKind, ForwardMap, Prediction, fingerprint_of
 
 
@@ -84,8 +87,15 @@ def fem_forward(simulator: Simulator, start: ForwardMap | None = None) -> FEMFor
     return FEMForward(simulator, all_nodes(simulator.scene), start)
 
 
+def by_solver(solver: EquilibriumSolver, start: ForwardMap | None = None) -> ForwardMap:
+    """Return ``solver`` as a forward map over all nodes; that of a specimen is one already."""
+    if isinstance(solver, Homogeneous):
+        return solver
+    return fem_forward(cast(Simulator, solver), start)
+
+
 FEM = ForwardKind(
     "fem",
     "finite elements, from rest each time",
-    lambda ingredients, _: fem_forward(ingredients.simulator),
+    lambda ingredients, _: by_solver(ingredients.simulator),
 )

@@ -34,10 +34,9 @@ from emulator.fem.campaign.designs import sobol
 from emulator.fem.simulator import Simulator
 from emulator.scenes.gripped import Piece, pieces
 from emulator.scenes.grips import Learned
-from emulator.scenes.scene import Scene
-from emulator.scenes.specimen import states_of
+from emulator.scenes.specimen import Specimen
 from emulator.scenes.states import States
-from emulator.surrogates.homogeneous import homogeneous_stresses
+from emulator.surrogates.homogeneous import Homogeneous, homogeneous, homogeneous_stresses
 from emulator.surrogates.polynomial import Samples, fit, legendre, terms
 from emulator.surrogates.protocol import fingerprint_of
 
@@ -60,7 +59,7 @@ def added(P: jax.Array, shares: jax.Array) -> jax.Array:
     return P + jnp.where(loaded, jnp.sqrt(jnp.where(loaded, square, 1.0)), 0.0) * shares
 
 
-def gripped_stresses(scene: Scene, P: jax.Array, theta: jax.Array) -> jax.Array:
+def gripped_stresses(scene: Specimen, P: jax.Array, theta: jax.Array) -> jax.Array:
     """Return homogeneous stresses (m, 3, 3) with what the scene's grips add, if it was learned."""
     if scene.grips is None or (learned := scene.grips.learned) is None:
         return P
@@ -91,23 +90,23 @@ class GrippedState:
 class GrippedSpecimen:
     """FEM of a specimen between its grips.
 
-    specimen : the scene of its homogeneous states, with grips.
+    specimen : the specimen, with grips.
 
-    :class:`InputError` for a scene without grips, or as of
+    :class:`InputError` for a specimen without grips, or as of
     :func:`~emulator.scenes.gripped.pieces`.
     """
 
-    specimen: Scene
+    specimen: Specimen
 
     def __post_init__(self) -> None:
         if self.specimen.grips is None:
             raise InputError(f"scene '{self.specimen.name}' says nothing of grips")
         self.simulators  # noqa: B018 - refuses directions that a piece cannot have
 
-    @cached_property
+    @property
     def states(self) -> States:
         """The states of the specimen."""
-        return states_of(self.specimen)
+        return self.specimen.states
 
     @cached_property
     def pieces(self) -> Mapping[str, Piece]:
@@ -120,9 +119,9 @@ class GrippedSpecimen:
         return {piece: Simulator(piece.scene) for piece in dict.fromkeys(self.pieces.values())}
 
     @cached_property
-    def homogeneous(self) -> Simulator:
-        """FEM of the homogeneous states."""
-        return Simulator(self.specimen)
+    def homogeneous(self) -> Homogeneous:
+        """The homogeneous states without grips."""
+        return homogeneous(self.specimen)
 
     @property
     def workers(self) -> int:
@@ -231,7 +230,7 @@ def _spread(rows: np.ndarray, sizes: np.ndarray) -> np.ndarray:
 
 
 def learn_grips(
-    specimen: Scene, runs: int = RUNS, *, seed: int = 0, progress: bool = False
+    specimen: Specimen, runs: int = RUNS, *, seed: int = 0, progress: bool = False
 ) -> Learned:
     """Return what grips add to a specimen's stresses, from FEM at ``runs`` theta of its box.
 
@@ -291,7 +290,7 @@ def _best(samples: Samples, acting: np.ndarray) -> tuple[int, float]:
     return min(errors.items(), key=lambda item: item[1])
 
 
-def of_grips(specimen: Scene) -> str:
+def of_grips(specimen: Specimen) -> str:
     """Return a short hash of a specimen and how it was held."""
     grips = specimen.grips
     assert grips is not None

@@ -14,8 +14,9 @@ incompressible specimen needs no pressure: the last free stretch follows from th
 
 and its pull, if it has one, does work like the others. First derivatives are those of the
 equilibrium, by the implicit function theorem. All states are one batch, and so are all theta under
-``vmap``. FEM of the same scene gives the same numbers for a compressible law; for an incompressible
-map it tells what the law's bulk modulus changes.
+``vmap``. The compressible map is what certificates compare an incompressible one with: it tells
+what the law's bulk modulus changes. It is exact, as finite elements are of such a state
+(:mod:`emulator.verify.homogeneous`).
 """
 
 from __future__ import annotations
@@ -32,10 +33,10 @@ import numpy as np
 from emulator.core.errors import InputError
 from emulator.fem.energy import point_energy
 from emulator.fem.material_point import stress_and_moduli
+from emulator.fem.solution import Solution, Status
 from emulator.mechanics.kinematics import cofactor, determinant
-from emulator.scenes.scene import Scene, all_nodes, check_nodes
-from emulator.scenes.specimen import states_of
-from emulator.scenes.states import States
+from emulator.scenes.scene import all_nodes, check_nodes
+from emulator.scenes.specimen import Specimen, require_specimen
 from emulator.surrogates.protocol import ForwardKind, Prediction, fingerprint_of
 
 _ITERATIONS = 300  # an exponent falls by about 1 in each, far away
@@ -51,32 +52,27 @@ _FLAT = 1e-10  # least pivot, relative to the stiffness
 class Homogeneous:
     """The states of a specimen as a forward map.
 
-    scene, nodes : the specimen's scene, and the nodes (k,) whose displacement is returned.
+    scene, nodes : the specimen, and the nodes (k,) whose displacement is returned.
     incompressible : whether no state changes its volume, whatever the law's bulk modulus.
 
     Raises
     ------
     InputError
-        A scene that is no specimen or has loads besides pulls; an incompressible state without a
-        free direction.
+        A scene that is no specimen; an incompressible state without a free direction.
     """
 
-    scene: Scene
+    scene: Specimen
     nodes: np.ndarray
     incompressible: bool = False
 
     def __post_init__(self) -> None:
-        closed = np.flatnonzero(~self.states.free.any(axis=1))  # refuses what is no specimen
+        require_specimen(self.scene)
+        closed = np.flatnonzero(~self.scene.states.free.any(axis=1))
         if self.incompressible and len(closed):
             raise InputError(
                 f"state {closed[0] + 1} of '{self.scene.name}' has no free direction: an "
                 "incompressible specimen needs one in each state"
             )
-
-    @cached_property
-    def states(self) -> States:
-        """The states of the specimen, in the order of its elements."""
-        return states_of(self.scene)
 
     @property
     def kind(self) -> str:
@@ -107,52 +103,87 @@ class Homogeneous:
         return jax.jit(self._evaluate)
 
     def _evaluate(self, theta: jax.Array) -> Prediction:
-        elements, rows, corners = self._places
+        rows, of_node = np.unique(self.nodes // 3, return_inverse=True)
+        H, _, pulls, _ = self.scene.states
         point = Point(point_energy(self.scene, theta), stress_and_moduli(self.scene, theta))
-        tissue = jax.tree.map(lambda each: each[elements, 0], self.scene.tissue_at(theta))
-        guesses = _GUESSES if self.states.pulls.any() else _GUESSES[:0]
-        settled, converged = jax.vmap(partial(equilibrium, point, guesses))(
-            jnp.asarray(self.states.gradients[elements]),
-            jnp.asarray(self.states.pulls[elements]),
-            *self._free(elements),
-            tissue,
+        tissue = jax.tree.map(lambda values: values[rows], self.scene.tissue_at(theta))
+        settled, converged = jax.vmap(partial(equilibrium, point, self._guesses))(
+            jnp.asarray(H[rows]), jnp.asarray(pulls[rows]), *self._free(rows), tissue
         )
-        columns = jnp.swapaxes(settled, 1, 2)[rows, np.maximum(corners - 1, 0)]
-        u = jnp.where((corners > 0)[:, None], columns, 0.0)
-        return Prediction(u, jnp.all(converged))
+        columns = jnp.swapaxes(settled, 1, 2)[of_node, self.nodes % 3]
+        return Prediction(columns, jnp.all(converged))
 
-    def _free(self, elements: np.ndarray) -> tuple[jax.Array, jax.Array]:
+    @property
+    def _guesses(self) -> np.ndarray:
+        return _GUESSES if self.scene.states.pulls.any() else _GUESSES[:0]
+
+    def _free(self, rows: np.ndarray) -> tuple[jax.Array, jax.Array]:
         """Return the axes (e, u) of the free stretches, 3 for none, and that of the last, (e,).
 
         The last one follows from the others where the specimen is incompressible, else it is 3.
         It is one without a pull, if any free direction has none.
         """
-        free, pulls = self.states.free[elements], self.states.pulls[elements]
+        free, pulls = self.scene.states.free[rows], self.scene.states.pulls[rows]
         order = np.argsort(2 * ~free + 1 * (pulls == 0.0), axis=1, kind="stable")
         axes = np.where(np.take_along_axis(free, order, axis=1), order, 3)
         count = (axes < 3).sum(axis=1)
-        last = np.full(len(elements), 3)
+        last = np.full(len(rows), 3)
         if self.incompressible:
-            last = axes[np.arange(len(elements)), count - 1]
-            axes[np.arange(len(elements)), count - 1] = 3
+            last = axes[np.arange(len(rows)), count - 1]
+            axes[np.arange(len(rows)), count - 1] = 3
             count = count - 1
         return jnp.asarray(axes[:, : count.max(initial=0)]), jnp.asarray(last)
-
-    @cached_property
-    def _places(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the elements (e,) of the nodes, and each node's row (k,) there and corner (k,)."""
-        flat = self.scene.mesh.elements.ravel()
-        position = np.argsort(flat)[self.nodes]  # each node is in one element
-        elements, rows = np.unique(position // 4, return_inverse=True)
-        return elements, rows, position % 4
 
     def at(self, nodes: np.ndarray) -> Homogeneous:
         """Return the map restricted to ``nodes``: only their states are computed."""
         return replace(self, nodes=check_nodes(self.scene, nodes))
 
+    # What a simulator does, so that certificates run the states where they run FEM of a scene.
+
+    def solve(self, theta: jax.Array, start: jax.Array | None = None) -> Solution:  # noqa: ARG002
+        """Return the equilibrium of all states at ``theta`` (p,); a ``start`` is not needed."""
+        u, valid = self.evaluate(jnp.asarray(theta, dtype=float))
+        status = jnp.where(valid, Status.CONVERGED, Status.ITERATION_LIMIT)
+        count = jnp.zeros((), dtype=int)  # Newton's steps of a state are not counted
+        return Solution(u, status, count, count, jnp.zeros(()), jnp.where(valid, 1.0, 0.0))
+
+    def sensitivities(self, u: jax.Array, theta: jax.Array) -> jax.Array:  # noqa: ARG002
+        """Return the derivatives (p, n, 3) of the equilibrium in ``theta`` (p,)."""
+        return self._slopes(theta)
+
+    @cached_property
+    def _slopes(self) -> Callable[[jax.Array], jax.Array]:
+        slopes = jax.jacfwd(lambda theta: self._evaluate(theta).displacement)
+        return jax.jit(lambda theta: jnp.moveaxis(slopes(theta), -1, 0))
+
+    @property
+    def has_energy(self) -> bool:
+        """Whether an equilibrium is a minimum or a saddle of some energy: it always is."""
+        return True
+
+    def is_stable(self, u: jax.Array, theta: jax.Array) -> bool:
+        """Return whether each state at ``u`` (n, 3) mm is a minimum in its free stretches."""
+        moduli = self._moduli(self.scene.gradients(u), theta)
+        free = self.scene.states.free
+        stiffness = np.einsum("miijj->mij", np.asarray(moduli))
+        both = free[:, :, None] & free[:, None, :]
+        return bool((np.linalg.eigvalsh(np.where(both, stiffness, np.eye(3))) > 0.0).all())
+
+    @cached_property
+    def _moduli(self) -> Callable[[jax.Array, jax.Array], jax.Array]:
+        def moduli(H: jax.Array, theta: jax.Array) -> jax.Array:
+            of_point = stress_and_moduli(self.scene, theta)
+            return jax.vmap(of_point)(H, self.scene.tissue_at(theta))[1]
+
+        return jax.jit(moduli)
+
+    def volume_ratio(self, u: jax.Array) -> jax.Array:
+        """Return J = det F of the states (m,) at ``u`` (n, 3) mm."""
+        return jax.vmap(determinant)(self.scene.gradients(u) + jnp.eye(3))
+
 
 def homogeneous_stresses(
-    scene: Scene, u: jax.Array, theta: jax.Array
+    scene: Specimen, u: jax.Array, theta: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     r"""Return gradients H and first Piola-Kirchhoff stresses P in kPa of the states, (m, 3, 3).
 
@@ -166,18 +197,15 @@ def homogeneous_stresses(
     It vanishes where a compressible specimen is in equilibrium, and is the unknown of an
     incompressible one.
 
-    u : the displacement (n, 3) mm of all nodes of the specimen ``scene``.
+    u : the displacement (3 m, 3) mm of all nodes of the specimen ``scene``.
     """
-    elements, given = scene.mesh.elements, states_of(scene)
-    free = given.free
-    H = jnp.swapaxes(u[elements[:, 1:]] - u[elements[:, :1]], 1, 2)
-    tissue = jax.tree.map(lambda each: each[:, 0], scene.tissue_at(theta))
-    of_law = jax.vmap(jax.grad(point_energy(scene, theta)))(H, tissue)
+    free, H = scene.states.free, scene.gradients(u)
+    of_law = jax.vmap(jax.grad(point_energy(scene, theta)))(H, scene.tissue_at(theta))
     last = np.where(free.any(axis=1), 2 - np.argmax(free[:, ::-1], axis=1), 3)
     cofactors = jax.vmap(cofactor)(H + jnp.eye(3))
     is_last = jnp.asarray(last[:, None] == np.arange(3))
     along = jnp.where(is_last, jnp.diagonal(cofactors, axis1=1, axis2=2), 1.0)
-    excess = jnp.diagonal(of_law, axis1=1, axis2=2) - given.pulls
+    excess = jnp.diagonal(of_law, axis1=1, axis2=2) - scene.states.pulls
     pressure = jnp.sum(jnp.where(is_last, excess / along, 0.0), axis=1)
     return H, of_law - pressure[:, None, None] * cofactors
 
@@ -336,7 +364,7 @@ def _solved(K: jax.Array, rhs: jax.Array) -> jax.Array:
     return jnp.stack(y)
 
 
-def homogeneous(scene: Scene, *, incompressible: bool = False) -> Homogeneous:
+def homogeneous(scene: Specimen, *, incompressible: bool = False) -> Homogeneous:
     """Return the states of the specimen ``scene`` as a forward map, see :class:`Homogeneous`."""
     return Homogeneous(scene, all_nodes(scene), incompressible)
 
@@ -344,10 +372,10 @@ def homogeneous(scene: Scene, *, incompressible: bool = False) -> Homogeneous:
 HOMOGENEOUS = ForwardKind(
     "homogeneous",
     "states of a specimen, without a mesh",
-    lambda ingredients, _: homogeneous(ingredients.scene),
+    lambda ingredients, _: homogeneous(require_specimen(ingredients.scene)),
 )
 INCOMPRESSIBLE = ForwardKind(
     "incompressible",
     "the same, without changes of volume",
-    lambda ingredients, _: homogeneous(ingredients.scene, incompressible=True),
+    lambda ingredients, _: homogeneous(require_specimen(ingredients.scene), incompressible=True),
 )

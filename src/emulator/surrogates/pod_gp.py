@@ -142,8 +142,8 @@ def _fit_one(inputs: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nda
 
 def _build(ingredients: Ingredients, options: Options) -> ForwardMap:
     thetas = sobol(ingredients.scene, options["fem_runs"], ingredients.seed)
-    runs = run_campaign(ingredients.simulator, thetas, progress=ingredients.progress)
-    return fit_reduced(ingredients.scene, runs)
+    runs = run_campaign(ingredients.fem, thetas, progress=ingredients.progress)
+    return fit_reduced(ingredients.fem.scene, runs)
 
 
 def _from_arrays(scene: Scene, arrays: Arrays) -> ReducedForward:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, cast
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,10 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.fem.simulator import Simulator
-from emulator.scenes.scene import Scene, check_nodes
+from emulator.fem.solution import EquilibriumSolver
+from emulator.scenes.forward_problem import ForwardProblem
+from emulator.scenes.scene import check_nodes
+from emulator.scenes.specimen import with_mesh
 
 
 class Prediction(NamedTuple):
@@ -32,7 +35,7 @@ class ForwardMap(Protocol):
 
     kind, label : the names of its kind, e.g. ``corrected``, and of the map in pictures and tables,
         e.g. ``emulator + 2 Newton steps``.
-    scene : the scene whose displacement it predicts.
+    scene : the scene whose displacement it predicts, or the specimen.
     nodes : the nodes at which it predicts, (k,), in the order of its rows.
     fingerprint : a short hash of everything that shapes the prediction (:func:`fingerprint_of`).
     """
@@ -44,7 +47,7 @@ class ForwardMap(Protocol):
     def label(self) -> str: ...  # noqa: D102
 
     @property
-    def scene(self) -> Scene: ...  # noqa: D102
+    def scene(self) -> ForwardProblem: ...  # noqa: D102
 
     @property
     def nodes(self) -> np.ndarray: ...  # noqa: D102
@@ -136,17 +139,23 @@ class Option:
 class Ingredients:
     """The ingredients from which forward maps are built.
 
-    scene, simulator : the scene and its FEM simulator.
+    scene, simulator : the scene or the specimen, and what solves it.
     emulator : a shipped name or a folder; ``None`` for the emulator shipped for the scene.
     seed : the seed of the design of FEM runs.
     progress : whether progress bars are shown.
     """
 
-    scene: Scene
-    simulator: Simulator
+    scene: ForwardProblem
+    simulator: EquilibriumSolver
     emulator: str | None = None
     seed: int = 0
     progress: bool = False
+
+    @property
+    def fem(self) -> Simulator:
+        """The simulator of a scene; :class:`InputError` for a specimen, which has no mesh."""
+        with_mesh(self.scene)
+        return cast(Simulator, self.simulator)
 
 
 @dataclass(frozen=True)
@@ -167,5 +176,5 @@ class ForwardKind:
     build: Callable[[Ingredients, Options], ForwardMap]
     options: tuple[Option, ...] = ()
     to_arrays: Callable[[ForwardMap], Arrays] | None = None
-    from_arrays: Callable[[Scene, Arrays], ForwardMap] | None = None
+    from_arrays: Callable[[Any, Arrays], ForwardMap] | None = None
     words: tuple[str, ...] = ()

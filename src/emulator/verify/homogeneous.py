@@ -6,7 +6,7 @@ along directions without a prescribed stretch.
 
 The formulas below are written out by hand in NumPy and share no code with the laws they are
 compared with. :func:`verify_homogeneous` solves the specimens (:mod:`emulator.scenes.specimen`) by
-finite elements, those of one law side by side in one scene.
+finite elements, one tetrahedron a state, those of one law side by side in one scene.
 """
 
 from __future__ import annotations
@@ -20,15 +20,20 @@ import numpy as np
 
 from emulator.fem import Simulator
 from emulator.fem.energy import displacement_gradient, strain_energy
+from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws import find_law
-from emulator.scenes import Parameter, Scene
-from emulator.scenes.specimen import specimen
+from emulator.scenes import Parameter, Scene, Support
+from emulator.scenes.loads.force import MN_PER_N, Force
+from emulator.scenes.specimen import Specimen, specimen
+from emulator.scenes.states import AXES
 from emulator.verify.benchmark import Benchmark
 
 Values = Mapping[str, float]
+_APART = 2.0  # mm between the tetrahedra of two states
+_VOLUME = 1.0 / 6.0  # mm3, of a tetrahedron
 
 
-def pulled(law: str, stretches: Sequence[float], values: Values | None = None) -> Scene:
+def pulled(law: str, stretches: Sequence[float], values: Values | None = None) -> Specimen:
     """Return a specimen of the law pulled along x, to each of the stretches, then along x and y.
 
     Its parameter is the law's first one; the others are constants.
@@ -45,6 +50,44 @@ def pulled(law: str, stretches: Sequence[float], values: Values | None = None) -
         constants=dict(fixed),
         fibres=[1.0, 0.0, 0.0] if description.fibres else None,
         sheets=[0.0, 1.0, 0.0] if description.sheets else None,
+    )
+
+
+def tetrahedra(given: Specimen) -> Scene:
+    r"""Return a scene of a specimen's states for finite elements, which are exact of them.
+
+    State i is a tetrahedron of nodes 4 i at the origin and 4 i + 1 to 4 i + 3 at :math:`e_x, e_y,
+    e_z` (mm), of which node k moves by column k of H. Supports hold what is prescribed. A pull P
+    along axis k is a dead force on :math:`e_k`, whose work :math:`V P H_{kk}` in the volume V of
+    1/6 mm3 makes it P/6 mN.
+    """
+    H, free, pulls, _ = given.states
+    count = len(H)
+    corners = np.vstack([np.zeros(3), np.eye(3)])
+    nodes = (_APART * np.arange(count)[:, None, None] * np.eye(3)[0] + corners).reshape(-1, 3)
+    elements = np.arange(4 * count).reshape(count, 4)
+    sets, supports, forces = {"origin": elements[:, 0]}, [Support("origin")], list[Force]()
+    for k, axis in enumerate(AXES):
+        held, loaded = np.flatnonzero(~free[:, k]), np.flatnonzero(pulls[:, k])
+        sets[axis] = elements[:, k + 1]
+        supports.append(Support(axis, H[:, :, k], components=AXES.replace(axis, "")))
+        if len(held):
+            sets[f"{axis}.held"] = elements[held, k + 1]
+            supports.append(Support(f"{axis}.held", H[held, :, k], components=axis))
+        if len(loaded):
+            sets[f"{axis}.pulled"] = elements[loaded, k + 1]
+            along = _VOLUME / MN_PER_N * pulls[loaded, k, None] * np.eye(3)[k]
+            forces.append(Force(f"{axis}.pulled", along))
+    return Scene(
+        name=given.name,
+        mesh=Mesh(nodes, elements, sets),
+        law=given.law,
+        parameters=given.parameters,
+        constants=given.constants,
+        loads=tuple(forces),
+        supports=tuple(supports),
+        fibres=given.fibres,
+        sheets=given.sheets,
     )
 
 
@@ -302,7 +345,7 @@ _NAMES = [f"{test}, stretch {s:g}" for test in ("uniaxial", "equibiaxial") for s
 
 def _by_fem(law: str) -> tuple[np.ndarray, np.ndarray]:
     """Return the stretches (4, 3) of the specimens, and their stress (4,) along x."""
-    scene = pulled(law, _STRETCHES)
+    scene = tetrahedra(pulled(law, _STRETCHES))
     theta = jnp.array([next(iter(SOLUTIONS[law][1].values()))])
     u = Simulator(scene).solve(theta).require_converged(scene.name).displacement
     H = np.asarray(displacement_gradient(scene, u))[:, 0]

@@ -1,4 +1,5 @@
 from dataclasses import fields, replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -22,7 +23,8 @@ from emulator.scenes.loads import (
     Traction,
 )
 from emulator.scenes.scene_data import SceneData
-from emulator.scenes.specimen import specimen
+from emulator.scenes.specimen import Specimen, specimen
+from emulator.scenes.states import states
 from emulator.scenes.supports import SUPPORTS, ElasticSupport
 from emulator.scenes.tissue import FibreAngles
 from emulator.scenes.tube import Tube
@@ -262,9 +264,27 @@ def piece(**changes):
     return replace(block(), **entries)
 
 
+STATES = states({"stretch_x": np.array([1.0, 1.1]), "shear_xy": np.array([0.0, 0.1])})
+PULLED = states({"applied_x": np.array([0.0, 2.0]), "stretch_y": np.array([1.0, 1.1])})
+TURNED_STATES = FibreAngles(np.tile([0.0, 0.0, 1.0], (2, 1)), {"angle": np.ones(2)})
+
+
 def specimen_of(**changes):
-    held = {"parameters": (Parameter("a", "kPa", 1.0, 2.0),), "loads": (), "grips": GRIPS}
-    return piece(**held | changes)
+    """Return a specimen in which every field can be changed alone."""
+    entries = {
+        "name": "piece",
+        "states": STATES,
+        "law": LAW,
+        "parameters": (Parameter("a", "kPa", 1.0, 2.0),),
+        "fibres": [1.0, 0.0, 0.0],
+        "sheets": [0.0, 1.0, 0.0],
+        "constants": {name: 1.0 for name in LAW.parameters if name != "a"},
+    } | changes
+    if entries.get("angles"):
+        entries["constants"] = entries["constants"] | {"angle": 0.5}
+    if len(getattr(entries.get("tube"), "layers", ())) > 1:
+        entries["constants"] = entries["constants"] | {"stiffness_1": 1.0}
+    return Specimen(**entries)
 
 
 # Another value of every field of a scene; a field that is neither here nor an exception fails.
@@ -283,10 +303,29 @@ FIELDS = {
     "angles": (TURNED,),
     "dilatation": "patch",
     "loaded_by": {"pressure": "imaged"},
-    "tube": TUBE,
 }
-# The same of what a field of a scene consists of.
+FIELDS_OF_SPECIMENS = {
+    "states": states({"stretch_x": np.array([1.0, 1.1]), "shear_xy": np.array([0.0, 0.2])}),
+    "law": FIELDS["law"],
+    "parameters": (Parameter("a", "kPa", 1.0, 3.0),),
+    "constants": specimen_of().constants | {"b": 2.0},
+    "fibres": [0.0, 0.0, 1.0],
+    "sheets": [0.0, 0.0, 1.0],
+    "angles": (TURNED_STATES,),
+    "tube": TUBE,
+    "grips": GRIPS,
+}
+# The same of what a field consists of.
 PARTS_OF_FIELDS = {
+    "states": (
+        PULLED,
+        {
+            "gradients": 1.1 * PULLED.gradients,
+            "free": ~PULLED.free,
+            "pulls": 1.1 * PULLED.pulls,
+            "protocols": {"creep": np.arange(2)},
+        },
+    ),
     "tube": (
         TUBE,
         {"inner_radius": 0.8, "layers": (0.05, 0.05), "opening_angle": 20.0, "points": 6},
@@ -319,38 +358,41 @@ PARTS_OF_FIELDS = {
 
 
 def test_every_field_of_a_scene_counts():
-    assert set(FIELDS) | {"grips"} | _LEFT_OUT == {each.name for each in fields(SceneData)}
+    assert set(FIELDS) | _LEFT_OUT - {"homogeneous"} == {each.name for each in fields(SceneData)}
     scenes = [piece(), *(piece(**{name: value}) for name, value in FIELDS.items())]
     assert len({scene.fingerprint for scene in scenes}) == len(scenes)
     assert not any(scenes[0].identity.agrees(scene.identity) for scene in scenes[1:] if
                    scene.parameters == scenes[0].parameters)  # fmt: skip
 
 
+def test_every_field_of_a_specimen_counts():
+    assert set(FIELDS_OF_SPECIMENS) | _LEFT_OUT == {each.name for each in fields(Specimen)}
+    pieces = [specimen_of()]
+    pieces += [specimen_of(**{name: value}) for name, value in FIELDS_OF_SPECIMENS.items()]
+    assert len({piece.fingerprint for piece in pieces}) == len(pieces)
+    assert specimen_of(homogeneous=True, name="other").fingerprint == pieces[0].fingerprint
+
+
 @pytest.mark.parametrize("name", PARTS_OF_FIELDS)
 def test_every_part_of_a_field_counts(name):
     part, others = PARTS_OF_FIELDS[name]
-    assert set(others) == {each.name for each in fields(part)}
+    names = part._fields if name == "states" else [each.name for each in fields(part)]
+    assert set(others) == set(names)
+    changed = part._replace if name == "states" else partial(replace, part)
 
     def scene(value):
         if name == "angles":
             return piece(angles=(value,))
-        if name == "tube":
-            return piece(tube=value)
-        return specimen_of(grips=value if name == "grips" else replace(GRIPS, learned=value))
+        if name == "learned":
+            return specimen_of(grips=replace(GRIPS, learned=value))
+        return specimen_of(**{name: value})
 
     told = {scene(part).fingerprint}
-    told |= {scene(replace(part, **{field: v})).fingerprint for field, v in others.items()}
+    told |= {scene(changed(**{field: v})).fingerprint for field, v in others.items()}
     assert len(told) == 1 + len(others)
 
 
-def test_tests_of_a_gripped_specimen_count():
-    sets = MESH.node_sets
-    named = replace(MESH, node_sets={**sets, "pull": sets["right"]})
-    assert specimen_of().fingerprint != specimen_of(mesh=named).fingerprint
-    assert piece().fingerprint == piece(mesh=named).fingerprint
-
-
-def test_scenes_without_grips_keep_the_fingerprint_that_saved_files_carry():
+def test_scenes_keep_the_fingerprint_that_saved_files_carry():
     assert em.scenes.once_clamped_beam(order=1).fingerprint == "a963beb3023c18b0"
     assert em.scenes.once_clamped_beam().fingerprint == "7ea647097ea5c9ad"
     strip = specimen(
@@ -358,8 +400,7 @@ def test_scenes_without_grips_keep_the_fingerprint_that_saved_files_carry():
         law=LAWS["neo_hookean"],
         parameters=(Parameter("mu", "kPa", 5.0, 20.0), Parameter("lam", "kPa", 1.0, 100.0)),
     )
-    assert strip.fingerprint == "d262dd0036477a7d"
-    assert len({replace(strip, grips=g).fingerprint for g in (None, GRIPS)}) == 2
+    assert strip.fingerprint == "ed09f1b5398a0703"
 
 
 def test_an_identity_refuses_what_it_cannot_describe():

@@ -1,13 +1,16 @@
 """Tables of a specimen's states: what they mean, and what they cannot mean."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import calibrate as cal
 import emulator as em
+from emulator.catalogue import find_problem
 from emulator.core.errors import InputError
 from emulator.scenes.file import read_scene
 from emulator.scenes.grips import Grips
-from emulator.scenes.specimen import read_states, specimen, states_of
+from emulator.scenes.specimen import read_states, require_specimen, specimen, with_mesh
 from emulator.scenes.states import states, with_unit
 
 NAN = np.nan
@@ -106,19 +109,37 @@ def of_law(given, **entries):
     )
 
 
-def test_a_scene_has_the_states_that_made_it():
+def test_a_specimen_has_its_states_and_their_gradients():
     columns = {"stretch_x": np.array([1.1, NAN, 1.3]), "shear_yz": np.array([0.0, 0.2, 0.1])}
     given = states(columns, ["x", "shear", "origin"])  # names that corners might have
-    again = states_of(of_law(given))
-    np.testing.assert_array_equal(again.gradients, given.gradients)
-    np.testing.assert_array_equal(again.free, given.free)
-    assert {n: r.tolist() for n, r in again.protocols.items()} == {
+    piece = of_law(given)
+    assert piece.states is given
+    assert {n: r.tolist() for n, r in piece.measured.protocols.items()} == {
         "x": [0],
         "shear": [1],
         "origin": [2],
     }
+    u = jnp.arange(27.0).reshape(9, 3)  # column k of H is the displacement of corner k
+    np.testing.assert_array_equal(piece.gradients(u)[1][:, 2], u[3 + 2])
+    assert piece.node_count == 9
     with pytest.raises(InputError, match="is no specimen"):
-        states_of(em.find_scene("twisting_cube"))
+        require_specimen(em.find_scene("twisting_cube"))
+
+
+def test_what_needs_a_mesh_refuses_a_specimen_in_one_line(tmp_path):
+    piece = of_law(states({"stretch_x": np.array([1.0, 1.1])}))
+    for use in (with_mesh, lambda scene: scene.mesh, em.Simulator, cal.CavityVolume):
+        with pytest.raises(InputError, match="is a specimen, which has no mesh") as caught:
+            use(piece)
+        assert "\n" not in str(caught.value)
+    (tmp_path / "table.csv").write_text("stretch_x,stress_x\n1.0,0\n1.1,1\n")
+    (tmp_path / "scene.toml").write_text(SCENE)
+    for name in ("", "finer:"):
+        with pytest.raises(InputError, match="is a specimen, which has no mesh"):
+            em.find_scene(f"{name}{tmp_path / 'scene.toml'}")
+    wide = find_problem(f"wider:{tmp_path / 'scene.toml'}")
+    assert wide.parameters[0].high > read_scene(tmp_path / "scene.toml").parameters[0].high
+    assert wide.origin["scene"] == "wider"
 
 
 PULLED = {
@@ -128,7 +149,7 @@ PULLED = {
 }
 
 
-def test_a_scene_has_the_pulls_that_made_it():
+def test_pulls_are_in_kpa_and_in_the_fingerprint():
     given = states(PULLED, ["pulled", "pulled", "moved", "moved", "pressed"])
     expected = [[0.0, 0.0, 0.0], [10.0, 3.0, 0.0], [0.0] * 3, [0.0] * 3, [-2.0, 0.0, 0.0]]
     np.testing.assert_allclose(given.pulls, expected)
@@ -136,30 +157,14 @@ def test_a_scene_has_the_pulls_that_made_it():
     assert not given.gradients[:2].any()  # what is measured is not prescribed
     np.testing.assert_allclose(given.paths, [0.0, 1.0, 0.0, 0.2, 0.0])
     scene = of_law(given)
-    np.testing.assert_allclose(states_of(scene).pulls, given.pulls, rtol=1e-15)
-    np.testing.assert_array_equal(states_of(scene).free, given.free)
+    np.testing.assert_array_equal(scene.states.pulls, given.pulls)
     other = states(PULLED | {"applied_y": np.array([0.0, 3.1, NAN, NAN, NAN])}, ordered=False)
     assert of_law(other).fingerprint != scene.fingerprint
     assert of_law(given).fingerprint == scene.fingerprint
 
 
-def test_a_specimen_has_no_loads_but_pulls():
+def test_grips_do_not_pull():
     given = states({"applied_x": np.array([0.0, 2.0])})
-    for load in (
-        em.loads.Gravity(),
-        em.loads.Force("corner.x.pulled", (1.0, 0.0, 0.0), amount="share"),
-        em.loads.Force("corner.x.pulled", (0.0, 1.0, 0.0)),
-    ):
-        extra = (em.Parameter("share", "", 0.0, 1.0),) if load.quantities else ()
-        scene = specimen(
-            given,
-            law=em.find_law("neo_hookean"),
-            parameters=(em.Parameter("mu", "kPa", 5.0, 20.0), *extra),
-            constants={"lam": 50.0},
-            loads=(load,),
-        )
-        with pytest.raises(InputError, match="a specimen has no loads but pulls"):
-            em.homogeneous(scene)
     with pytest.raises(InputError, match="grips move a specimen"):
         of_law(given, grips=Grips((8.0, 4.0, 2.0)))
 
@@ -188,8 +193,8 @@ def test_a_scene_file_names_the_table(tmp_path):
     )
     (tmp_path / "scene.toml").write_text(SCENE)
     scene = read_scene(tmp_path / "scene.toml")
-    assert len(scene.mesh.elements) == 2
-    assert scene.mesh.node_set("pull").tolist() == list(range(8))
+    assert len(scene.states.free) == 2
+    assert scene.states.protocols["pull"].tolist() == [0, 1]
     (tmp_path / "scene.toml").write_text(SCENE.replace("[parameters", "order = 2\n[parameters", 1))
     with pytest.raises(InputError, match="line 4: a specimen has none"):
         read_scene(tmp_path / "scene.toml")
@@ -199,7 +204,7 @@ def test_a_scene_file_names_the_table(tmp_path):
         read_scene(tmp_path / "scene.toml")
     (tmp_path / "table.csv").write_text("applied_x [Pa],strain_x\n0,0\n2000,0.1\n")
     (tmp_path / "scene.toml").write_text(SCENE)
-    np.testing.assert_allclose(states_of(read_scene(tmp_path / "scene.toml")).pulls[1], [2, 0, 0])
+    np.testing.assert_allclose(read_scene(tmp_path / "scene.toml").states.pulls[1], [2, 0, 0])
     (tmp_path / "scene.toml").write_text("grips = {size = [8.0, 4.0, 2.0]}\n" + SCENE)
     with pytest.raises(InputError, match="grips move a specimen"):
         read_scene(tmp_path / "scene.toml")

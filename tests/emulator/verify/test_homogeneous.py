@@ -32,7 +32,7 @@ def by_map(scene):
     """The stretches (m, 3) of a specimen's states by the forward map."""
     theta = jnp.array([SOLUTIONS[scene.law.name][1][scene.parameter_names[0]]])
     u = np.asarray(jax.jit(homogeneous(scene).evaluate)(theta).displacement)
-    return 1.0 + np.stack([u[scene.mesh.elements[:, k + 1], k] for k in range(3)], axis=1)
+    return 1.0 + np.stack([u[k::3, k] for k in range(3)], axis=1)
 
 
 def test_every_law_has_a_solution():

@@ -129,11 +129,12 @@ def _klotz(model: Model, seed: int) -> KlotzBand | None:
     from calibrate.measurements.klotz import klotz_of
     from calibrate.measurements.volume import pressure_volume
     from calibrate.posterior.predictions import klotz_band
+    from emulator.scenes.specimen import with_mesh
     from emulator.surrogates.fem import FEMForward
 
     if isinstance(model.forward, FEMForward) or (curve := pressure_volume(model.full)) is None:
         return None
-    if klotz_of(model.forward.scene, curve.rest, curve.pressures[-1]) is None:
+    if klotz_of(with_mesh(model.forward.scene), curve.rest, curve.pressures[-1]) is None:
         return None
     return klotz_band(model, seed=seed)
 

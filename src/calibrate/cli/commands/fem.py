@@ -15,12 +15,17 @@ from emulator.core.errors import InputError
 from emulator.core.store import check_folder
 
 if TYPE_CHECKING:
+    import jax
+
     from emulator.fem import Solution
     from emulator.fem.unloading import Unloaded
-    from emulator.scenes.scene import Scene
+    from emulator.scenes.forward_problem import ForwardProblem
+    from emulator.scenes.specimen import Specimen
 
 
-def _solved(scene: Scene, theta: Any, solution: Solution | Unloaded) -> tuple[dict[str, Any], str]:
+def _solved(
+    scene: ForwardProblem, theta: Any, solution: Solution | Unloaded
+) -> tuple[dict[str, Any], str]:
     """Return what a solve came to, as plain JSON and in a line."""
     from emulator.fem import Status
 
@@ -53,8 +58,12 @@ def simulate(arguments: Namespace) -> Answer:
     from emulator.fem.fields import element_fields
     from emulator.fem.reactions import supported_sets
     from emulator.geometry.io import write_solution
+    from emulator.scenes.specimen import Specimen, with_mesh
 
-    scene = words.scene_of(arguments)
+    problem = words.problem_of(arguments)
+    if isinstance(problem, Specimen) and not arguments.out:
+        return _simulate_states(problem, words.theta_of(arguments, problem))
+    scene = with_mesh(problem)
     theta = words.theta_of(arguments, scene)
     if arguments.out:
         words.check_vtu(arguments.out)
@@ -100,6 +109,25 @@ def simulate(arguments: Namespace) -> Answer:
             "an unstable equilibrium: it has buckled, and any imperfection leads elsewhere"
         )
     return Answer(result, "\n".join(lines), converged)
+
+
+def _simulate_states(specimen: Specimen, theta: jax.Array) -> Answer:
+    """Solve each state of a specimen, and return its volume ratios and stresses."""
+    import numpy as np
+
+    from emulator.surrogates.homogeneous import homogeneous, homogeneous_stresses
+
+    states = homogeneous(specimen)
+    solution = states.solve(theta)
+    J = np.asarray(states.volume_ratio(solution.displacement))
+    P = np.asarray(homogeneous_stresses(specimen, solution.displacement, theta)[1])
+    result, _ = _solved(specimen, theta, solution)
+    result |= {"J_range": [float(J.min()), float(J.max())], "stresses_kPa": P.tolist()}
+    lines = [
+        f"{specimen.name}: {result['status']}, {len(J)} states",
+        f"J from {J.min():.4f} to {J.max():.4f}, stress up to {np.abs(P).max():.4g} kPa",
+    ]
+    return Answer(result, "\n".join(lines), bool(solution.converged))
 
 
 MESH, LOADED = "unloaded.vtu", "loaded.vtu"

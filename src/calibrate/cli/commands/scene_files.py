@@ -77,7 +77,6 @@ def init(arguments: Namespace) -> Answer:
 def _init_specimen(table_path: Path, out: str | Path, arguments: Namespace) -> Answer:
     """Write the files for a table, and say what was guessed."""
     from calibrate.project.specimen import draft_specimen
-    from emulator.scenes.specimen import measured_states
 
     if arguments.unit is not None:
         raise InputError(
@@ -88,7 +87,7 @@ def _init_specimen(table_path: Path, out: str | Path, arguments: Namespace) -> A
     result = {
         "out": str(draft.path),
         "scene": str(draft.scene_path),
-        "states": len(measured_states(draft.scene).free),
+        "states": len(draft.scene.measured.free),
         "law": draft.scene.law.name,
         "parameters": list(draft.scene.parameter_names),
         "notes": list(draft.notes),

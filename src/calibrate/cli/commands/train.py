@@ -9,12 +9,12 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from calibrate.cli.words import Answer, add_scene, command, flag, option, scene_of, seconds
+from calibrate.cli.words import Answer, add_scene, command, flag, option, problem_of, seconds
 from emulator.core.errors import InputError
 from emulator.core.store import check_folder
 
 if TYPE_CHECKING:
-    from emulator.scenes.scene import Scene
+    from emulator.scenes.specimen import Specimen
     from emulator.training.plan import Plan
 
 
@@ -69,13 +69,15 @@ def _add_plan(parser: ArgumentParser) -> None:
 def train(arguments: Namespace) -> Answer:
     """Train and write an emulator."""
     from calibrate.provenance import hardware, versions
+    from emulator.scenes.specimen import Specimen, with_mesh
     from emulator.surrogates import load, save_emulator
     from emulator.training import remove_checkpoint
     from emulator.training import train as train_emulator
 
-    scene = scene_of(arguments)
-    if scene.grips is not None:
-        return _train_grips(scene, arguments)
+    problem = problem_of(arguments)
+    if isinstance(problem, Specimen) and problem.grips is not None:
+        return _train_grips(problem, arguments)
+    scene = with_mesh(problem)
     check_folder(arguments.out)
     entries = _plan_entries(arguments)
     start = load(arguments.start) if arguments.start else None
@@ -121,7 +123,7 @@ def train(arguments: Namespace) -> Answer:
     return Answer({"out": arguments.out, **record}, text)
 
 
-def _train_grips(scene: Scene, arguments: Namespace) -> Answer:
+def _train_grips(scene: Specimen, arguments: Namespace) -> Answer:
     """Learn and write what the grips of a specimen add to its stresses."""
     from emulator.surrogates.gripped import RUNS, learn_grips
 

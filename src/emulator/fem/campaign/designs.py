@@ -13,6 +13,7 @@ import numpy as np
 from emulator.core.errors import InputError
 from emulator.fem.campaign.campaign import run_campaign
 from emulator.fem.simulator import Simulator
+from emulator.scenes.forward_problem import ForwardProblem
 from emulator.scenes.scene import Scene
 
 TEST_SEED = 90_210  # separate test points: training and reduced models use small seeds
@@ -20,7 +21,7 @@ _CORNER_EVERY = 5  # every fifth theta of a design is a corner of the box
 _MOST_CORNERED = 6  # parameters up to which the box's corners are used; more have too many
 
 
-def sobol(scene: Scene, count: int, seed: int) -> jax.Array:
+def sobol(scene: ForwardProblem, count: int, seed: int) -> jax.Array:
     """Return ``count`` theta (count, p) of a scrambled Sobol sequence over the box's scales."""
     qmc = _samplers(count, seed)
     bits = max(count - 1, 1).bit_length()

@@ -30,7 +30,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -40,8 +40,10 @@ from emulator.core.errors import InputError
 from emulator.core.store import exclusive
 from emulator.fem.campaign.campaign import Field, Runs, StoredRuns
 from emulator.fem.campaign.workers import Row, Solver
+from emulator.fem.simulator import Simulator
 from emulator.fem.solution import Status
 from emulator.scenes.scene import Scene
+from emulator.scenes.specimen import with_mesh
 
 _MISSING = -1
 _FORMAT = 1
@@ -67,12 +69,12 @@ class Campaign:
     @property
     def scene(self) -> Scene:
         """The scene that is solved."""
-        return self.solver.simulator.scene
+        return with_mesh(self.solver.simulator.scene)
 
     @property
     def options(self) -> dict[str, Any]:
         """Everything that rows depend on besides scene and theta, as plain JSON."""
-        newton = asdict(self.solver.simulator.options)
+        newton = asdict(cast(Simulator, self.solver.simulator).options)
         return {"newton": newton, "sensitivities": self.solver.sensitivities}
 
     def hashes(self, thetas: np.ndarray) -> list[str]:

@@ -27,7 +27,8 @@ from emulator.fem.compiled import compiled
 from emulator.fem.energy import potential_energy
 from emulator.fem.linear.suitesparse import keeping_factors
 from emulator.fem.simulator import Simulator
-from emulator.fem.solution import Solution, Status
+from emulator.fem.solution import EquilibriumSolver, Solution, Status
+from emulator.scenes.specimen import with_mesh
 
 _BYTES_A_NODE = 100_000  # memory of a concurrent solve; 54 000 measured at 33 605 nodes
 _MEMORY_SHARE = 0.5  # share of the machine's memory that solves may take
@@ -83,7 +84,7 @@ class Solver:
     from_rest_again : solve a second time, from rest, where a start fails.
     """
 
-    simulator: Simulator
+    simulator: EquilibriumSolver
     sensitivities: bool = False
     energy: bool = False
     from_rest_again: bool = True
@@ -121,12 +122,13 @@ class Solver:
             starts = starts[-1:]
         if len(starts) > 1:
             stacked = jnp.stack([jnp.asarray(start) for start in starts])
+            assert isinstance(self.simulator, Simulator)
             return _best(self.simulator.system, stacked, theta)
         return jnp.asarray(starts[0]) if starts else None
 
     @cached_property
     def _energy(self):  # noqa: ANN202 - a compiled program, private
-        return jax.jit(potential_energy(self.simulator.scene))
+        return jax.jit(potential_energy(with_mesh(self.simulator.scene)))
 
 
 @compiled
@@ -142,7 +144,7 @@ def _best(system: System, starts: jax.Array, theta: jax.Array) -> jax.Array:
 
 
 # ---- many solves ---------------------------------------------------------------------------------
-def at_once(simulator: Simulator, nodes: int | None = None) -> int:
+def at_once(simulator: EquilibriumSolver, nodes: int | None = None) -> int:
     """Return how many solves this machine does at once, limited by its cores and its memory.
 
     It is 1 on large meshes, where a factor is kept between solves, and
