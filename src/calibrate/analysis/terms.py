@@ -18,6 +18,7 @@ from jax.flatten_util import ravel_pytree
 from scipy.special import bdtr
 
 from calibrate.analysis.term_sets import PRESENT, posterior_of_sets, seen_columns
+from calibrate.measurements.specimens import SpecimenCurves
 from calibrate.noise import information_about_means
 from calibrate.statistical_model.model import Model
 from emulator.core.display import TableRepr
@@ -165,8 +166,9 @@ def _of_tests(model: Model) -> dict[str, np.ndarray]:
     """Return the entries (k,) of each test in the data as ``ravel_pytree`` orders them."""
     entries, begin = dict[str, list[np.ndarray]](), 0
     for _, part in sorted(model.observe.parts.items()):
-        for test, own in part.data_of_tests.items():
-            entries.setdefault(test, []).append(begin + own)
+        tests = part.data_of_tests if isinstance(part, SpecimenCurves) else {}
+        for test, rows in tests.items():
+            entries.setdefault(test, []).append(begin + rows)
         begin += int(np.prod(part.shape))
     return {test: np.concatenate(each) for test, each in entries.items()}
 

@@ -204,10 +204,6 @@ class Observations:
             data |= rest(u.reshape(len(states), -1, 3), thetas[states])
         return {name: data[name] for name in self.parts}, valid
 
-    def gripped(self, shares: np.ndarray) -> Observations:
-        """Return the same observations of a gripped specimen, see :meth:`Observation.gripped`."""
-        return replace(self, parts={n: part.gripped(shares) for n, part in self.parts.items()})
-
     def expand[T](self, values: Mapping[str, T], what: str) -> dict[str, tuple[str, T]]:
         """Return values by the parts' names, from values by name, with or without its load state.
 

@@ -90,7 +90,6 @@ class Observation(ABC):
     other_units : units the data may be in by mistake, each with the factor that converts it.
     usual_sd : the standard deviation of the noise where none is given; None if it must be given.
     positive : whether the number must be above 0.
-    curve_axis : the words for the x of :attr:`curves`.
     nodes : the nodes whose displacement it needs, (k,).
 
     and has ``entries`` (n,), the positions in the raveled data that are not missing, ascending;
@@ -104,7 +103,6 @@ class Observation(ABC):
     quantity: ClassVar[str]
     usual_sd: ClassVar[float | None] = None
     positive: ClassVar[bool] = True
-    curve_axis: ClassVar[str] = ""
     unit: str
     other_units: Mapping[str, float] = {}
     nodes: np.ndarray
@@ -142,16 +140,6 @@ class Observation(ABC):
     def sites(self) -> Sites | None:
         """The position of each number of the data; None for what has no one position."""
         return None
-
-    @property
-    def curves(self) -> Mapping[str, tuple[np.ndarray, np.ndarray]]:
-        """The curves that the data are points of, by name: x (k,) and entries (k,) of the data."""
-        return {}
-
-    @property
-    def data_of_tests(self) -> Mapping[str, np.ndarray]:
-        """The entries (k,) of the data of each of a specimen's tests, by its name."""
-        return {}
 
     @property
     def matrix(self) -> csr_array | None:
@@ -260,15 +248,6 @@ class Observation(ABC):
         is only nearly in equilibrium.
         """
         return None
-
-    def gripped(self, shares: np.ndarray) -> Self:
-        """Return the observation with what the grips of a specimen add to its stresses.
-
-        shares : the part (d, 3, 3) of each state's homogeneous stress.
-
-        :class:`InputError` for an observation that is not of such stresses.
-        """
-        raise InputError(f"'{self.kind}' says nothing of a specimen's grips")
 
     @property
     def default_noise(self) -> GaussianNoise:

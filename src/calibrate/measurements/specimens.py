@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, ClassVar, Self
 
@@ -12,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from calibrate.measurements.collection import Observations
 from calibrate.measurements.observation import Block, Field
 from calibrate.measurements.points import PointObservation
 from calibrate.noise.protocol import Sites
@@ -31,13 +33,14 @@ class SpecimenCurves(PointObservation):
     A kind computes them from all nodes in ``_measured``, and gives its columns.
 
     scene : the specimen; :class:`InputError` for another scene.
+    curve_axis : the label of the x axis of :attr:`curves`.
     """
 
     scene: Scene
 
     place_field = Field("motion", ("stretch_x",), where=True)
     constants = {"stretch": "stretches"}
-    curve_axis = "way from the first state of each test, in stretch"
+    curve_axis: ClassVar[str] = "way from the first state of each test, in stretch"
     positive = False
     at_rest: ClassVar[float] = 0.0
     """The number that is measured at rest."""
@@ -96,7 +99,7 @@ class SpecimenCurves(PointObservation):
 
     @property
     def curves(self) -> Mapping[str, tuple[np.ndarray, np.ndarray]]:
-        """The curve of each test and component, over the way from its first state."""
+        """The curve of each test and component: x (k,) and the entries (k,) of the data."""
         names = self.components or (self.name,)
         every = np.arange(len(self.paths) * len(names))
         states, columns = np.divmod(every if self.entries is None else self.entries, len(names))
@@ -107,6 +110,15 @@ class SpecimenCurves(PointObservation):
                 if len(own):
                     found[f"{test} {name}".strip()] = self.paths[states[own], 0], own
         return found
+
+    def gripped(self, shares: np.ndarray) -> Self:
+        """Return the observation with the stress that grips add.
+
+        shares : the added stress of each state as a fraction of its homogeneous stress, (d, 3, 3).
+
+        :class:`InputError` for an observation to which grips add nothing.
+        """
+        raise InputError(f"'{self.kind}' says nothing of a specimen's grips")
 
     def rows(self) -> tuple[str, np.ndarray]:
         """Return the numbers of the states."""
@@ -189,6 +201,19 @@ class Components(SpecimenCurves):
         """Return the observation of ``components``, as text joined by commas."""
         texts = components.split(",") if isinstance(components, str) else components
         return cls(scene, tuple(str(text) for text in texts))  # type: ignore[call-arg]
+
+
+def gripped_observations(observe: Observations, shares: np.ndarray) -> Observations:
+    """Return the observations of a specimen with the stress that its grips add.
+
+    Arguments and errors are those of :meth:`SpecimenCurves.gripped`.
+    """
+    parts = {}
+    for name, part in observe.parts.items():
+        if not isinstance(part, SpecimenCurves):
+            raise InputError(f"'{part.kind}' says nothing of a specimen's grips")
+        parts[name] = part.gripped(shares)
+    return replace(observe, parts=parts)
 
 
 def check_tests(observed: Mapping[str, tuple[Any, np.ndarray]]) -> None:

@@ -85,7 +85,7 @@ class Stress(Components):
             self._check_grips(self.scene.grips.learned.shares[0])
 
     def gripped(self, shares: np.ndarray) -> Self:
-        """Return the same stresses with what grips add, (d, 3, 3) as shares of a state's stress.
+        """Return the stresses with those that grips add.
 
         :class:`InputError` where a component acts on no grip.
         """

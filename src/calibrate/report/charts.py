@@ -16,6 +16,7 @@ from calibrate.analysis.identifiability import stress_band
 from calibrate.figures import BLUE, COLOURS, VERMILION, with_unit
 from calibrate.measurements import Observation
 from calibrate.measurements.klotz import klotz_of
+from calibrate.measurements.specimens import SpecimenCurves
 from calibrate.measurements.volume import PressureVolume, in_mmhg, pressure_volume
 from calibrate.posterior import Posterior
 from calibrate.state_names import split
@@ -59,7 +60,7 @@ def against_data(posterior: Posterior) -> Iterator[tuple[str, go.Figure]]:
         values = np.asarray(tree["posterior_predictive"][name])
         values = values.reshape(values.shape[0] * values.shape[1], -1)
         data = np.ravel(np.asarray(posterior.data[name]))
-        if part.curves:
+        if isinstance(part, SpecimenCurves):
             yield name, _curves(part, values, data)
             continue
         if values.shape[1] > 1:
@@ -101,7 +102,7 @@ def _many_numbers(name: str, part: Observation, values: np.ndarray, data: np.nda
     return figure
 
 
-def _curves(part: Observation, values: np.ndarray, data: np.ndarray) -> go.Figure:
+def _curves(part: SpecimenCurves, values: np.ndarray, data: np.ndarray) -> go.Figure:
     """Return each curve of an observation: data, and the 90 % band of predictions."""
     low, high = np.nanquantile(values, [0.05, 0.95], axis=0)
     figure = go.Figure()
