@@ -165,11 +165,11 @@ def find_terms(
 def _of_tests(model: Model) -> dict[str, np.ndarray]:
     """Return the entries (k,) of each test in the data as ``ravel_pytree`` orders them."""
     entries, begin = dict[str, list[np.ndarray]](), 0
-    for _, part in sorted(model.observe.parts.items()):
-        tests = part.data_of_tests if isinstance(part, SpecimenCurves) else {}
-        for test, rows in tests.items():
-            entries.setdefault(test, []).append(begin + rows)
-        begin += int(np.prod(part.shape))
+    for name, part in sorted(model.observe.parts.items()):
+        if isinstance(part, SpecimenCurves):
+            for test, rows in part.tests(model.observe.entries.get(name)).items():
+                entries.setdefault(test, []).append(begin + rows)
+        begin += int(np.prod(model.observe.shapes[name]))
     return {test: np.concatenate(each) for test, each in entries.items()}
 
 
@@ -183,7 +183,7 @@ def _whitening(model: Model) -> np.ndarray:
         scales[name] = {
             key: prior.mean * np.sqrt(np.pi / 2.0) for key, prior in noise.priors.items()
         }
-    means = {name: jnp.zeros(part.shape) for name, part in model.observe.parts.items()}
+    means = {name: jnp.zeros(shape) for name, shape in model.observe.shapes.items()}
     information = np.asarray(information_about_means(model.noise, means, scales))
     return np.linalg.cholesky(information).T
 

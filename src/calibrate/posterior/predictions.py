@@ -28,7 +28,7 @@ import numpy as np
 import numpyro.distributions as dist
 from numpyro import handlers
 
-from calibrate.measurements import Observation
+from calibrate.measurements import Observation, Observations
 from calibrate.measurements.klotz import PRESSURE_SCATTER, Klotz
 from calibrate.measurements.outputs import Outputs
 from calibrate.measurements.volume import pressure_volume
@@ -73,7 +73,7 @@ def log_likelihood(
 @lru_cache(maxsize=4)
 def outputs_of(forward: ForwardMap, observe: Observation) -> Outputs:
     """Return the outputs; cached, so that a loop over pressures compiles once."""
-    return Outputs(forward, {"observed": observe})
+    return Outputs(forward, Observations({"observed": observe}))
 
 
 def replicates(
