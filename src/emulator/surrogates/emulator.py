@@ -10,7 +10,7 @@ r"""The emulator of a scene, a sum of parts of which any may be absent, and its 
     \quad\text{where free}
 
 with :math:`x` the position of theta in its unit box. The sum knows its parts only as
-:class:`~emulator.surrogates.part.Part`.
+:class:`~emulator.surrogates.part.EmulatorPart`.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from emulator.surrogates.coarse import Coarse
 from emulator.surrogates.discrepancy import Discrepancy
 from emulator.surrogates.network import Network
 from emulator.surrogates.network.family import FamilyNetwork
-from emulator.surrogates.part import CachedPart, Part, arrays_of, together
+from emulator.surrogates.part import CachedPart, EmulatorPart, arrays_of, together
 from emulator.surrogates.polynomial import Polynomial
 from emulator.surrogates.protocol import (
     ForwardKind,
@@ -57,7 +57,7 @@ FORMAT = 3
 """The format of files: ``emulator.json`` describes, ``weights.safetensors`` has the arrays."""
 SHIPPED = Path(__file__).parent.parent / "shipped"
 
-PARTS: dict[str, type[Part]] = {
+PARTS: dict[str, type[EmulatorPart]] = {
     "coarse": Coarse,
     "taylor": Expansion,
     "polynomial": Polynomial,
@@ -103,7 +103,7 @@ class Emulator(TableRepr):
         return f"Emulator of '{self.scene.name}'", [*about, rows[0], rows[-1]]
 
     @property
-    def parts(self) -> dict[str, Part]:
+    def parts(self) -> dict[str, EmulatorPart]:
         """The parts that are present, in the order they are summed."""
         named = {name: getattr(self, name) for name in PARTS}
         return {name: part for name, part in named.items() if part is not None}

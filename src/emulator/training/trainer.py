@@ -22,7 +22,7 @@ from emulator.surrogates.network.pignn import Architecture
 from emulator.training.checkpoint import CHECKPOINT, SWEEPS, Session
 from emulator.training.mechanics import Mechanics
 from emulator.training.paper import Paper
-from emulator.training.physics import Physics
+from emulator.training.physics import PhysicsPlan
 from emulator.training.plan import Job, Plan
 from emulator.training.sweeps import Sweeps
 from emulator.training.two_meshes import TwoMeshes
@@ -30,7 +30,7 @@ from emulator.training.two_meshes import TwoMeshes
 _ALL: tuple[Plan, ...] = (
     Mechanics(),
     TwoMeshes(),
-    Physics(),
+    PhysicsPlan(),
     Sweeps(),
     Paper(),
 )
