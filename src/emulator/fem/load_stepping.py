@@ -99,8 +99,7 @@ class LoadStepping:
         state = state._replace(
             tangent=step.tangent, history=state.history._replace(singular=step.singular)
         )
-        without_couplings = step._replace(couplings=None, tangent=None)
-        after = _next_state(state, without_couplings, self.options)
+        after = _next_state(state, step._replace(couplings=None), self.options)
         if state.auxiliary is None:
             return after
         # The other unknowns follow the step, or begin anew at another load level.

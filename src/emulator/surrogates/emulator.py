@@ -21,7 +21,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -31,13 +31,13 @@ from scipy.sparse import csr_array
 from emulator.catalogue import scene_from_origin
 from emulator.core.display import TableRepr
 from emulator.core.errors import InputError, look_up
+from emulator.core.rooms import offered
 from emulator.core.store import inside, read_arrays, read_json, save_arrays, write_json
 from emulator.fem.reactions import SupportForce
 from emulator.scenes.scene import Scene, all_nodes, check_nodes
 from emulator.surrogates.coarse import Coarse
 from emulator.surrogates.discrepancy import Discrepancy
 from emulator.surrogates.network import Network
-from emulator.surrogates.network.family import FamilyNetwork
 from emulator.surrogates.part import CachedPart, EmulatorPart, arrays_of, together
 from emulator.surrogates.polynomial import Polynomial
 from emulator.surrogates.protocol import (
@@ -53,6 +53,9 @@ from emulator.surrogates.protocol import (
 from emulator.surrogates.support_work import SupportWork, amount_of
 from emulator.surrogates.taylor import Expansion
 
+if TYPE_CHECKING:
+    from emulator.surrogates.network.family import FamilyNetwork
+
 FORMAT = 3
 """The format of files: ``emulator.json`` describes, ``weights.safetensors`` has the arrays."""
 SHIPPED = Path(__file__).parent.parent / "shipped"
@@ -62,7 +65,11 @@ PARTS: dict[str, type[EmulatorPart]] = {
     "taylor": Expansion,
     "polynomial": Polynomial,
     "network": Network,
-    "family": FamilyNetwork,
+    **dict(
+        zip(
+            ["family"], offered("emulator.surrogates.network.family", "FamilyNetwork"), strict=False
+        )
+    ),
     "discrepancy": Discrepancy,
 }
 """The kinds of parts in the order of the sum, by the field of :class:`Emulator`."""

@@ -60,7 +60,7 @@ def test_few_frames_lie_between_a_command_and_its_data_and_its_likelihood():
     """An experiment's data was parsed four times, by 10 frames. To the likelihood five frames are the
     sampler's, four the program's that evaluates it in blocks.
     """
-    parse, likelihood = journeys.parse(), journeys.likelihood()
+    parse, likelihood = journeys.parse().frames, journeys.likelihood().frames
     assert len(parse) <= 6
     assert len(likelihood) <= 18
     assert len(dict.fromkeys([*parse, *likelihood])) <= 21
