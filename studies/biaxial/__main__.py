@@ -22,7 +22,7 @@ import calibrate as cal
 import emulator as em
 from calibrate.figures import BLUE, ORANGE, pyplot
 from emulator.fem.campaign.designs import sobol
-from emulator.scenes.grips import Grips, Learned
+from emulator.scenes.grips import Grips, GripStresses
 from emulator.scenes.specimen import specimen
 from emulator.scenes.states import states
 from emulator.surrogates.gripped import GrippedSpecimen, learn_grips
@@ -41,7 +41,7 @@ LEVEL = 0.9
 LIMIT = 0.5  # posterior sd, beyond which the certificate refuses
 
 
-def scene_of(size: float, learned: Learned | None = None) -> em.Scene:
+def scene_of(size: float, learned: GripStresses | None = None) -> em.Scene:
     """The specimen: three tests, to equal strains and to half as much along one axis."""
     half, count = 1.0 + 0.5 * (STRETCHES - 1.0), len(STRETCHES)
     columns = {
@@ -66,7 +66,7 @@ def gripped(size: float) -> GrippedSpecimen:
 
 
 @lru_cache
-def learned(size: float, runs: int) -> Learned:
+def learned(size: float, runs: int) -> GripStresses:
     """What its grips do."""
     return learn_grips(gripped(size).specimen, runs, seed=SEED, progress=True)
 

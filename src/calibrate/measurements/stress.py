@@ -32,10 +32,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibrate.measurements.observation import Block, Field, Table
+from calibrate.measurements.observation import DataField, Layout, derive
 from calibrate.measurements.specimens import Components
 from emulator.core.errors import InputError
-from emulator.core.units import IN_KPA, IN_MM2, IN_MN, factor, other_units
+from emulator.core.units import IN_KPA, IN_MM2, IN_MN, factor
 from emulator.mechanics.kinematics import cofactor, determinant
 from emulator.scenes.specimen import Specimen
 from emulator.scenes.states import (
@@ -76,8 +76,6 @@ class Stress(Components):
     pattern = _COMPONENT
     such_as = "give stress, cauchy or second with its plane, such as stress_x or stress_xy"
     unit = "kPa"
-    other_units = other_units(IN_KPA, "MPa", "Pa", "mmHg")
-    value_fields = (Field("stress_x", ("stress_x",)),)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -85,13 +83,13 @@ class Stress(Components):
             self._check_grips(self.scene.grips.learned.shares[0])
 
     def gripped(self, shares: np.ndarray) -> Self:
-        """Return the same stresses with what grips add, (d, 3, 3) as shares of a state's stress.
+        """Return the stresses with those that grips add.
 
         :class:`InputError` where a component acts on no grip.
         """
         self._check_grips(shares)
-        part = copy(self)  # with the entries that are not missing
-        part._derive(shares=jnp.asarray(np.nan_to_num(shares)))
+        part = copy(self)
+        derive(part, shares=jnp.asarray(np.nan_to_num(shares)))
         return part
 
     def _check_grips(self, shares: np.ndarray) -> None:
@@ -118,18 +116,18 @@ class Stress(Components):
         return jnp.stack(numbers)
 
     @classmethod
-    def tables(cls, words: Collection[str]) -> dict[str, Table]:
-        """Return the table of the columns of motions and stresses; of one each as an example."""
+    def layouts(cls, words: Collection[str]) -> dict[str, Layout]:
+        """Return the layout of the columns of motions and stresses; of one each as an example."""
         given = [word for word in words if is_stress(word)]
         if not given and pull_columns(words):  # of measured stretches
             return {}
         areas = [w for w in words if given and _AREA.fullmatch(with_unit(w)[0])]
         columns = [*(motion_columns(words) or ["stretch_x"]), *(given or ["stress_x"]), *areas]
-        return {cls.name: Table((), tuple(Field(word, (word,)) for word in columns))}
+        return {cls.name: Layout((), tuple(DataField(word, (word,)) for word in columns))}
 
     @classmethod
     def read(
-        cls, scene: Specimen, name: str, table: Table, arrays: Mapping[str, np.ndarray]
+        cls, scene: Specimen, layout: Layout, arrays: Mapping[str, np.ndarray]
     ) -> tuple[Self, np.ndarray]:
         """Return the observation and its data in kPa, of the states that the scene has."""
         columns = _in_kpa(arrays)
@@ -163,11 +161,6 @@ class Stress(Components):
                     f"its axis? ({np.nanmin(values[:, k]):.3g} to {np.nanmax(values[:, k]):.3g} "
                     "kPa)"
                 )
-
-    def block(self, name: str, values: np.ndarray) -> Block:
-        """Return the motion of each state, and the stresses."""
-        of_stress = zip(self.components, values.reshape(len(values), -1).T, strict=True)
-        return [*self.motion(), *((Field(word, (word,)), x) for word, x in of_stress)]
 
 
 def is_stress(word: str) -> bool:

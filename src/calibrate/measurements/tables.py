@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from calibrate.measurements.observation import Block, Field
+from calibrate.measurements.observation import Block, DataField
 from calibrate.state_names import in_state, split, states_of
 from emulator.core import store
 from emulator.core.cells import TEXT, Cells, read_cells
@@ -72,11 +72,11 @@ class CSVTable:
                     )
         return values
 
-    def words_of(self, field: Field) -> tuple[str, ...]:
+    def words_of(self, field: DataField) -> tuple[str, ...]:
         """Return the words that hold ``field`` in a file of this format."""
         return field.columns
 
-    def arrays(self, fields: Sequence[Field], others: Collection[str]) -> dict[str, np.ndarray]:
+    def arrays(self, fields: Sequence[DataField], others: Collection[str]) -> dict[str, np.ndarray]:
         """Return arrays of numbers by variable, NaN where a measured value is missing.
 
         fields : the fields of an observation; the file has every word of theirs.
@@ -180,18 +180,18 @@ class NetCDFTable:
     def known(self) -> dict[str, float]:
         """The numbers in the variables ``known:NAME``."""
         words = [word for word in self.words if word.startswith(KNOWN)]
-        arrays = self.arrays([Field(word, (word,), where=True) for word in words])
+        arrays = self.arrays([DataField(word, (word,), where=True) for word in words])
         for word, array in arrays.items():
             if np.shape(array) != ():
                 raise InputError(f"data file {self.path}: variable '{word}' is not a number")
         return {word.removeprefix(KNOWN): float(array) for word, array in arrays.items()}
 
-    def words_of(self, field: Field) -> tuple[str, ...]:
+    def words_of(self, field: DataField) -> tuple[str, ...]:
         """Return the field's variable."""
         return (field.variable,)
 
     def arrays(
-        self, fields: Sequence[Field], others: Collection[str] = ()
+        self, fields: Sequence[DataField], others: Collection[str] = ()
     ) -> dict[str, np.ndarray]:
         """Return the variables as numbers."""
         arrays = {}

@@ -18,7 +18,7 @@ from emulator.geometry.side_by_side import check_name, shifted, side_by_side
 from emulator.mechanics.laws import Law, find_law
 from emulator.scenes.fibre_rules import Uniform
 from emulator.scenes.forward_problem import directions_read
-from emulator.scenes.grips import Grips, Learned
+from emulator.scenes.grips import Grips, GripStresses
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
 from emulator.scenes.specimen import Specimen, read_states
@@ -140,7 +140,7 @@ def _of_specimen(
         if file.grips is not None and file.grips != "none":
             of_grips = file.grips.model_dump()
             learned = of_grips.pop("learned")
-            learned = Learned.read(folder / learned) if learned else None
+            learned = GripStresses.read(folder / learned) if learned else None
             entries["grips"] = Grips(**of_grips, learned=learned)
     return Specimen, entries
 

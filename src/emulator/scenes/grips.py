@@ -13,7 +13,7 @@ from emulator.core.store import read_arrays, save_arrays
 
 
 @dataclass(frozen=True, eq=False)
-class Learned:
+class GripStresses:
     r"""What the grips add to the stresses of homogeneous states, as polynomials of theta.
 
     Of each state, :math:`P = P_h + |P_h| \sum_\alpha c_\alpha \varphi_\alpha(x)` with the
@@ -37,7 +37,7 @@ class Learned:
         save_arrays(path, {"degrees": self.degrees, "shares": self.shares}, words)
 
     @classmethod
-    def read(cls, path: str | Path) -> Learned:
+    def read(cls, path: str | Path) -> GripStresses:
         """Return what a file says; :class:`InputError` where it is of another kind."""
         arrays, words = read_arrays(path)
         if set(arrays) != {"degrees", "shares"} or set(words) != {"error", "of"}:
@@ -66,7 +66,7 @@ class Grips:
     hooks: int = 5
     cells: int = 8
     marks: float | None = None
-    learned: Learned | None = None
+    learned: GripStresses | None = None
 
     def __post_init__(self) -> None:
         if len(self.size) != 3 or not all(0.0 < length < np.inf for length in self.size):

@@ -33,7 +33,7 @@ from emulator.fem.campaign import at_once, in_order
 from emulator.fem.campaign.designs import sobol
 from emulator.fem.simulator import Simulator
 from emulator.scenes.gripped import Piece, pieces
-from emulator.scenes.grips import Learned
+from emulator.scenes.grips import GripStresses
 from emulator.scenes.specimen import Specimen
 from emulator.scenes.states import States
 from emulator.surrogates.homogeneous import Homogeneous, homogeneous, homogeneous_stresses
@@ -231,7 +231,7 @@ def _spread(rows: np.ndarray, sizes: np.ndarray) -> np.ndarray:
 
 def learn_grips(
     specimen: Specimen, runs: int = RUNS, *, seed: int = 0, progress: bool = False
-) -> Learned:
+) -> GripStresses:
     """Return what grips add to a specimen's stresses, from FEM at ``runs`` theta of its box.
 
     Theta at which FEM fails are left out.
@@ -268,7 +268,7 @@ def learn_grips(
     degree, error = _best(samples, ~np.isnan(shares[0]).ravel())
     fitted = fit(samples, degree, 0.0)
     coefficients = fitted.coefficients.reshape(-1, *shares.shape[1:])
-    return Learned(
+    return GripStresses(
         fitted.degrees,
         np.where(np.isnan(shares[0]), np.nan, coefficients),
         error,

@@ -10,7 +10,7 @@ from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws import LAWS
 from emulator.mechanics.laws.law import law_identity, probed
 from emulator.scenes import Parameter, Support
-from emulator.scenes.grips import Grips, Learned
+from emulator.scenes.grips import Grips, GripStresses
 from emulator.scenes.identity import _LEFT_OUT, _as_set, described
 from emulator.scenes.loads import (
     LOADS,
@@ -237,7 +237,7 @@ def test_every_field_of_every_load_and_support_counts(kind):
 LAW = LAWS["holzapfel_ogden_orthotropic"]
 COUNT = len(block().mesh.elements)
 DIRECTIONS = {axis: np.tile(np.eye(3)[k], (COUNT, 1)) for k, axis in enumerate("xyz")}
-LEARNED = Learned(np.zeros((1, 2)), np.zeros((1, 3, 3, 3)), 0.01, "of")
+LEARNED = GripStresses(np.zeros((1, 2)), np.zeros((1, 3, 3, 3)), 0.01, "of")
 GRIPS = Grips((10.0, 10.0, 1.0), marks=3.0, learned=LEARNED)
 TUBE = Tube(0.4, (0.1,))
 TURNED = FibreAngles(DIRECTIONS["z"], {"angle": np.ones(COUNT)})

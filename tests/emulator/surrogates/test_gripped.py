@@ -12,7 +12,7 @@ import emulator as em
 from emulator.core.errors import InputError
 from emulator.fem.energy import strain_energy
 from emulator.scenes.gripped import pieces
-from emulator.scenes.grips import Grips, Learned
+from emulator.scenes.grips import Grips, GripStresses
 from emulator.scenes.specimen import specimen
 from emulator.scenes.states import states
 from emulator.surrogates.gripped import GrippedSpecimen, learn_grips
@@ -120,7 +120,7 @@ def learned(strip):
 def test_learned_grips_are_added_to_stresses_of_any_map(strip, learned, tmp_path):
     assert learned.error < 0.01
     learned.write(tmp_path / "grips.safetensors")
-    read = Learned.read(tmp_path / "grips.safetensors")
+    read = GripStresses.read(tmp_path / "grips.safetensors")
     grips = replace(strip.specimen.grips, learned=read)
     scene = specimen({"stretch_x": PULL}, grips=grips, **ISOTROPIC)
     theta = jnp.array([8.0, 30.0])
