@@ -10,8 +10,8 @@ from emulator.core.errors import InputError
 from emulator.scenes.built_in import BUILT_IN
 from emulator.scenes.file import read_scene
 from emulator.scenes.finer import CHANGES, FINER, Finer, finer
-from emulator.scenes.scene import Scene
-from emulator.scenes.specimen import Specimen, with_mesh
+from emulator.scenes.scene import Scene, with_mesh
+from emulator.scenes.specimen import Specimen
 
 _RELEASED = "published:"
 

@@ -23,7 +23,7 @@ import emulator as em
 from calibrate.figures import BLUE, ORANGE, pyplot
 from emulator.fem.campaign.designs import sobol
 from emulator.scenes.grips import Grips, GripStresses
-from emulator.scenes.specimen import specimen
+from emulator.scenes.specimen import Specimen, specimen
 from emulator.scenes.states import states
 from emulator.surrogates.gripped import GrippedSpecimen, learn_grips
 
@@ -41,7 +41,7 @@ LEVEL = 0.9
 LIMIT = 0.5  # posterior sd, beyond which the certificate refuses
 
 
-def scene_of(size: float, learned: GripStresses | None = None) -> em.Scene:
+def scene_of(size: float, learned: GripStresses | None = None) -> Specimen:
     """The specimen: three tests, to equal strains and to half as much along one axis."""
     half, count = 1.0 + 0.5 * (STRETCHES - 1.0), len(STRETCHES)
     columns = {
@@ -71,7 +71,7 @@ def learned(size: float, runs: int) -> GripStresses:
     return learn_grips(gripped(size).specimen, runs, seed=SEED, progress=True)
 
 
-def model_of(scene: em.Scene) -> cal.Model:
+def model_of(scene: Specimen) -> cal.Model:
     """Independent errors of the stresses along x and y; stresses of homogeneous states, or more."""
     observe = cal.stresses(scene, "stress_x,stress_y")
     return cal.model(
@@ -86,7 +86,7 @@ def twin(size: float, theta: jnp.ndarray, seed: int) -> dict[str, np.ndarray]:
     return {"stress": P + NOISE * np.random.default_rng([SEED, seed]).normal(size=P.shape)}
 
 
-def sampled(scene: em.Scene, data: dict[str, np.ndarray]) -> cal.Posterior:
+def sampled(scene: Specimen, data: dict[str, np.ndarray]) -> cal.Posterior:
     """The posterior by the default sampler."""
     return cal.sample(model_of(scene), data, seed=SEED, predictions=False)
 

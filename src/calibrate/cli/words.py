@@ -177,7 +177,7 @@ def problem_of(arguments: Namespace) -> Scene | Specimen:
 
 def scene_of(arguments: Namespace) -> Scene:
     """Return the scene that :func:`add_scene` read; :class:`InputError` for a specimen."""
-    from emulator.scenes.specimen import with_mesh
+    from emulator.scenes.scene import with_mesh
 
     return with_mesh(problem_of(arguments))
 

@@ -14,7 +14,7 @@ from calibrate.figures import pyplot, save, with_unit
 from calibrate.measurements import DISPLACEMENT
 from calibrate.measurements.points import DisplacementPoints
 from calibrate.posterior import Posterior
-from emulator.scenes.specimen import with_mesh
+from emulator.scenes.scene import with_mesh
 from emulator.surrogates.network.graph import mesh_edges
 
 

@@ -11,7 +11,7 @@ from calibrate.figures import draw_body, panels, pyplot, save
 from emulator.accuracy.comparison import UNITS, Errors, log_density, quantiles
 from emulator.geometry.facets import flat_triangles
 from emulator.geometry.mesh import Mesh
-from emulator.scenes.specimen import with_mesh
+from emulator.scenes.scene import with_mesh
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

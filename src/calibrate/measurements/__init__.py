@@ -53,7 +53,7 @@ from calibrate.measurements.words import from_json, parse
 from calibrate.state_names import in_state, split
 from emulator.core.errors import InputError, look_up
 from emulator.scenes.forward_problem import ForwardProblem
-from emulator.scenes.specimen import with_mesh
+from emulator.scenes.scene import with_mesh
 
 # Kinds are tried in this order on a file's columns: `node` comes before `x,y,z`.
 OBSERVATIONS: dict[str, type[Observation]] = {

@@ -23,7 +23,7 @@ variables.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -49,27 +49,26 @@ from calibrate.measurements.tables import (
 )
 from calibrate.measurements.words import names_of, parse
 from calibrate.state_names import in_state, split
-from emulator.core.cells import SPREADSHEETS, TEXT
+from emulator.core.cells import SPREADSHEETS, TEXT, Cells
 from emulator.core.errors import InputError
 from emulator.scenes.forward_problem import ForwardProblem
 
 _OTHER_SPREADSHEETS = (".xls", ".ods")
-
-Reader = Callable[[Path], Mapping[str, DataTable]]
-"""Maps a file to the table of each of its load states."""
 
 Files = str | Path | Mapping[str, str]
 """A data file, or the file of each load state by the state's name."""
 
 
 def read_measurements(
-    scene: ForwardProblem, files: Files
+    scene: ForwardProblem, files: Files, table: Cells | None = None
 ) -> tuple[Observations, dict[str, np.ndarray], dict[str, float]]:
     """Return the observations of a file, their data by the same names, and known parameters.
 
     Of several files, by load state, each has the data of its state. A file with states of its own,
     such as a loading curve ``pull``, has those of ``pull.1``, ``pull.2`` and so on. Parameters are
     known from columns ``known:NAME``, and returned by ``parameter@state``.
+
+    table : the content of one of the files, where it has just been read.
 
     :class:`InputError` for a missing or malformed file, a place that is not finite, an infinite
     value, an unknown node, a point outside, an unknown cavity, a known value that differs within
@@ -88,11 +87,15 @@ def read_measurements(
         if file.suffix.lower() in _OTHER_SPREADSHEETS:
             raise InputError(f"data file {path} is a spreadsheet; save it as CSV")
         of_cells = file.suffix.lower() in (*TEXT, *SPREADSHEETS)
-        read: Reader = read_csv if of_cells else read_netcdf
-        for own, table in read(file).items():
+        by_state: Mapping[str, DataTable]
+        if table is not None and table.path.samefile(file):
+            by_state = read_csv(table._replace(path=file))
+        else:
+            by_state = read_csv(file) if of_cells else read_netcdf(file)
+        for own, content in by_state.items():
             state = ".".join(filter(None, (given, own)))
-            known |= {in_state(name, state): value for name, value in table.known.items()}
-            for name, (part, values) in _observed(scene, table, state).items():
+            known |= {in_state(name, state): value for name, value in content.known.items()}
+            for name, (part, values) in _observed(scene, content, state).items():
                 parts[name], data[name] = part, values
     return Observations(parts), data, known
 

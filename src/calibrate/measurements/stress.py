@@ -40,7 +40,6 @@ from emulator.mechanics.kinematics import cofactor, determinant
 from emulator.scenes.specimen import Specimen
 from emulator.scenes.states import (
     AXES,
-    components_of,
     motion_columns,
     pull_columns,
     with_unit,
@@ -135,10 +134,11 @@ class Stress(Components):
         part = cls(scene, tuple(columns)).check_motion(motions)
         values = np.column_stack(list(columns.values()))
         part._check_signs(values)
-        pulled = ~np.isnan(components_of(motions)[1])
-        for component, each in columns.items():
+        pulls = {axis: arrays[word] for axis, word in pull_columns(arrays).items()}
+        for component, stress in columns.items():
             _, row, column = _parts(component)
-            if row == column and (pulled[:, row] & ~np.isnan(each)).any():
+            pull = pulls.get(AXES[row], np.nan)
+            if row == column and not np.isnan(pull + stress).all():
                 raise InputError(
                     f"column '{component}' is the stress of a direction that has 'applied_"
                     f"{AXES[row]}': what the machine applies is no data, leave the column out"

@@ -130,12 +130,12 @@ def _without_units(cells: Cells) -> Cells:
     return cells._replace(words=[own.get(w, (w, 1.0))[0] for w in cells.words], rows=rows)
 
 
-def read_csv(path: Path) -> dict[str, CSVTable]:
+def read_csv(table: Path | Cells) -> dict[str, CSVTable]:
     """Return the table of each load state, by the column ``state`` or a loading curve's rows.
 
     One empty name where the file names no state.
     """
-    whole = _without_units(read_cells(path))
+    whole = _without_units(table if isinstance(table, Cells) else read_cells(table))
     words, rows = whole.words, whole.rows
     curve = any(w.startswith(KNOWN) for w in words) and not {STATE, *_PLACES} & set(words)
     if STATE not in words and not curve:
@@ -145,7 +145,7 @@ def read_csv(path: Path) -> dict[str, CSVTable]:
         state = str(number) if curve else cell[STATE]
         if not state or "@" in state or "/" in state:
             raise InputError(
-                f"data file {path}: row {number}, column '{STATE}' is '{state}'; "
+                f"data file {whole.path}: row {number}, column '{STATE}' is '{state}'; "
                 "give every row the name of its load state, without @ and /"
             )
         states.setdefault(state, {})[number] = cell

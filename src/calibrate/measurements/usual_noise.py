@@ -9,7 +9,7 @@ from calibrate.measurements.words import names_of
 from calibrate.noise.gaussian import GaussianNoise
 from emulator.core.errors import InputError
 from emulator.scenes.forward_problem import ForwardProblem
-from emulator.scenes.specimen import with_mesh
+from emulator.scenes.scene import with_mesh
 
 LARGEST_SHARE = 0.03
 """Largest default sd of noise as a share of the body's size, or of the cavity's volume."""

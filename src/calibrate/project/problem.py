@@ -33,7 +33,8 @@ from emulator.core.kept import kept
 from emulator.fem import NewtonOptions, Simulator
 from emulator.fem.solution import EquilibriumSolver
 from emulator.scenes.forward_problem import ForwardProblem
-from emulator.scenes.specimen import Specimen, with_mesh
+from emulator.scenes.scene import with_mesh
+from emulator.scenes.specimen import Specimen
 from emulator.surrogates import registry
 from emulator.surrogates.fem import by_solver
 from emulator.surrogates.homogeneous import homogeneous
@@ -117,13 +118,16 @@ def read_problem(
         return run
     with naming(where):
         run.sampling()
-        scene = find_problem(run.scene, run.root) if scene is None else scene
+        table = None
+        if scene is None:
+            scene = find_problem(run.scene, run.root)
+            table = scene.table if isinstance(scene, Specimen) else None
         if run.is_synthetic:
             names = {**run.known, **run.truth}
             states = tuple(dict.fromkeys(state for _, state in map(split, names) if state))
             observe, data = parse_observation(scene, run.observe, run.seed, states or ("",)), None
         else:
-            observe, data, in_files = read_measurements(scene, run.data)
+            observe, data, in_files = read_measurements(scene, run.data, table)
             for name, value in in_files.items():
                 if run.known.get(name, value) != value:
                     raise InputError(

@@ -12,7 +12,7 @@ from calibrate.measurements.specimens import SpecimenCurves
 from calibrate.measurements.stress import is_stress
 from calibrate.measurements.stretch import Stretch
 from calibrate.measurements.tube import TubeForce, TubePressure
-from emulator.core.cells import read_cells
+from emulator.core.cells import Cells, read_cells
 from emulator.core.errors import InputError
 from emulator.mechanics.laws import Law, find_law
 from emulator.mechanics.laws.law import Quantity
@@ -82,9 +82,10 @@ def draft_specimen(
             raise InputError(f"{path} is there already; remove it or give --out another name")
     if not table.is_file():
         raise InputError(f"data file {table} does not exist")
-    given = read_states(table, tube)
+    cells = read_cells(table)
+    given = read_states(cells, tube)
     count = len(given.free) // (tube.size if tube else 1)
-    largest, slope = _size(table, given, tube)
+    largest, slope = _size(cells, given, tube)
     moved = (np.diagonal(given.gradients, axis1=1, axis2=2) != 0.0) | (given.pulls != 0.0)
     axes = [axis for axis, own in zip(AXES, moved.T, strict=True) if own.any()]
     chosen = "holzapfel_gasser_ogden" if len(axes) > 1 else "holzapfel_ogden_isotropic"
@@ -107,14 +108,13 @@ def draft_specimen(
         ),
     ]
     of_tube = (TubePressure.column, TubeForce.column)
-    names = {word: with_unit(word) for word in read_cells(table).words}
+    names = {word: with_unit(word) for word in cells.words}
     pulls = pull_columns(names).values()
     measured = [w for w, (n, _) in names.items() if is_stress(w) or w in pulls or n in of_tube]
     if bare := [w for w in measured if not names[w][1]]:
         notes.insert(1, f"{', '.join(bare)} without a unit: kPa, forces mN; others in brackets")
-    left_out = len(_every_row(table)) - count
-    if left_out:
-        notes.insert(1, f"{left_out} rows of unloading are left out")
+    if cells.unloading:
+        notes.insert(1, f"{cells.unloading} rows of unloading are left out")
     folder = scene_path.resolve().parent
     source = table.resolve()
     name = source.relative_to(folder) if source.is_relative_to(folder) else source
@@ -133,16 +133,12 @@ def draft_specimen(
     return SpecimenDraft(out, scene_path, scene, tuple(notes))
 
 
-def _every_row(table: Path) -> list[int]:
-    return list(read_cells(table, unloading=True).rows)
-
-
 def _tests(given: States) -> str:
     names = [name for name in given.protocols if name]
     return f"{len(names)} tests ({', '.join(names)})" if len(names) > 1 else "one test"
 
 
-def _size(table: Path, given: States, tube: Tube | None) -> tuple[_Sizes, float]:
+def _size(cells: Cells, given: States, tube: Tube | None) -> tuple[_Sizes, float]:
     """Return the size of each measurement, and the tissue's stiffness in kPa.
 
     A stress over the motion there, where it is largest, either measured or prescribed; of a tube,
@@ -153,10 +149,10 @@ def _size(table: Path, given: States, tube: Tube | None) -> tuple[_Sizes, float]
         parameters=(Parameter("mu", "kPa", 1.0, 10.0),), constants={
             "kappa": 10.0, **dict.fromkeys(_stiffnesses(tube), 1.0)},
     )  # fmt: skip
-    observe, data, _ = read_measurements(neutral, table)
+    observe, data, _ = read_measurements(neutral, cells.path, cells)
     parts = {n: part for n, part in observe.parts.items() if isinstance(part, SpecimenCurves)}
     if len(parts) < len(data):
-        raise InputError(f"data file {table} has {', '.join(observe.parts)} besides stresses")
+        raise InputError(f"data file {cells.path} has {', '.join(observe.parts)} besides stresses")
     ways = {
         name: np.nan_to_num(np.abs(data[name] - part.at_rest)).reshape(len(data[name]), -1)
         for name, part in parts.items()
@@ -164,7 +160,7 @@ def _size(table: Path, given: States, tube: Tube | None) -> tuple[_Sizes, float]
     sizes = {name: (part, float(ways[name].max())) for name, part in parts.items()}
     for name, (part, most) in sizes.items():
         if not most > 0.0:
-            raise InputError(f"data file {table}: each {name} is {part.at_rest or 'zero'}")
+            raise InputError(f"data file {cells.path}: each {name} is {part.at_rest or 'zero'}")
     motion = np.abs(neutral.measured.gradients).max(axis=(1, 2))
     stress = np.abs(neutral.measured.pulls).max(axis=1)
     stretches = ways.pop(Stretch.name, None)

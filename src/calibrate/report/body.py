@@ -15,8 +15,7 @@ from calibrate.posterior import Posterior
 from emulator.fem.fields import element_fields
 from emulator.fem.solution import EquilibriumSolver
 from emulator.geometry.facets import surface_mesh
-from emulator.scenes.scene import Scene
-from emulator.scenes.specimen import with_mesh
+from emulator.scenes.scene import Scene, with_mesh
 
 _DRAWS = 20
 _MOMENTS = 100  # draws from which mean and sd are computed

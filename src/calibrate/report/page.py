@@ -26,7 +26,8 @@ from calibrate.report.body import body_figure
 from calibrate.report.parts import Verdict
 from emulator.core.errors import InputError
 from emulator.core.store import read_json, replacing
-from emulator.scenes.specimen import Specimen, with_mesh
+from emulator.scenes.scene import with_mesh
+from emulator.scenes.specimen import Specimen
 
 _SHEET = 0.1  # thickness of a sheet, as a share of its width
 _SHIFTS = {

@@ -16,8 +16,7 @@ from emulator.fem.energy import displacement_gradient, potential_energy
 from emulator.fem.reactions import SupportForce, support_forces
 from emulator.geometry.facets import Cavity
 from emulator.scenes.loads.force import MN_PER_N
-from emulator.scenes.scene import Scene, cavity_sets
-from emulator.scenes.specimen import with_mesh
+from emulator.scenes.scene import Scene, cavity_sets, with_mesh
 from emulator.surrogates.protocol import ForwardMap
 
 UNITS = {

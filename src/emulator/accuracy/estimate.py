@@ -62,8 +62,7 @@ from emulator.fem.load_stepping import LoadStepping
 from emulator.fem.simulator import Simulator
 from emulator.fem.solution import NewtonState, Status
 from emulator.mechanics.kinematics import Barriers, Strain
-from emulator.scenes.scene import Scene
-from emulator.scenes.specimen import with_mesh
+from emulator.scenes.scene import Scene, with_mesh
 from emulator.scenes.tissue import Tissue
 from emulator.surrogates.protocol import ForwardMap
 

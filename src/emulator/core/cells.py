@@ -34,12 +34,14 @@ class Cells(NamedTuple):
     words : the names of the columns.
     rows : the text of each cell by column, by the row's number, from 1 after the header.
     decimal_comma : whether numbers may have decimal commas.
+    unloading : the number of rows of unloading, which are left out.
     """
 
     path: Path
     words: Sequence[str]
     rows: Mapping[int, Mapping[str, str]]
     decimal_comma: bool
+    unloading: int = 0
 
     def number(self, row: int, word: str, *, gaps: bool = False) -> float:
         """Return the number in a row and column; NaN where it is missing and may be.
@@ -60,8 +62,8 @@ class Cells(NamedTuple):
             ) from error
 
 
-def read_cells(path: Path, *, unloading: bool = False) -> Cells:
-    """Return the table of a CSV file or a spreadsheet, rows of unloading only if asked for.
+def read_cells(path: Path) -> Cells:
+    """Return the table of a CSV file or a spreadsheet.
 
     Raises
     ------
@@ -96,7 +98,8 @@ def read_cells(path: Path, *, unloading: bool = False) -> Cells:
             rows[number] = dict(zip(words, padded, strict=False))
     if words and not rows:
         raise InputError(f"data file {path}: names of columns, and no row below them")
-    if BRANCH in words and not unloading:
+    every = len(rows)
+    if BRANCH in words:
         rows = {k: row for k, row in rows.items() if row[BRANCH].lower() != UNLOADING}
         if not rows:
             raise InputError(
@@ -104,7 +107,7 @@ def read_cells(path: Path, *, unloading: bool = False) -> Cells:
                 f"was recorded while it unloads from its end: reverse its rows, without '{BRANCH}'"
             )
     _check_marks(path, rows, decimal_comma=decimal_comma)
-    return Cells(path, words, rows, decimal_comma)
+    return Cells(path, words, rows, decimal_comma, every - len(rows))
 
 
 def _check_marks(path: Path, rows: Mapping[int, Mapping[str, str]], *, decimal_comma: bool) -> None:

@@ -40,8 +40,7 @@ from emulator.fem.loaded import LoadedEquilibrium
 from emulator.fem.newton import NewtonOptions
 from emulator.fem.reactions import balanced, nodes_of, reactions
 from emulator.fem.solution import Solution
-from emulator.scenes.scene import Scene
-from emulator.scenes.specimen import with_mesh
+from emulator.scenes.scene import Scene, with_mesh
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -28,8 +28,7 @@ from emulator.mechanics.laws import find_law
 from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.file import read_scene
 from emulator.scenes.loads import CavityPressure, FollowerPressure, Gravity, Load, SurfacePressure
-from emulator.scenes.scene import Scene
-from emulator.scenes.specimen import with_mesh
+from emulator.scenes.scene import Scene, with_mesh
 from emulator.scenes.supports.dirichlet import Support, loose_parts
 
 _METRES = 0.6  # a body smaller than this in all directions is taken to be in m

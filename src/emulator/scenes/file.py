@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from emulator.core.cells import read_cells
 from emulator.core.errors import InputError, look_up
 from emulator.geometry.io import Body, read_body, read_mesh, read_modes, read_regions
 from emulator.geometry.mesh import Mesh
@@ -127,8 +128,10 @@ def _of_specimen(
         tube = None if file.tube is None else Tube(**file.tube.model_dump())
     with source.at("specimen"):
         assert file.specimen is not None
-        states = read_states(folder / file.specimen, tube)
-    entries: Entries = {"states": states, "tube": tube, "homogeneous": file.grips == "none"}
+        table = read_cells(folder / file.specimen)
+        states = read_states(table, tube)
+    entries: Entries = {"states": states, "tube": tube, "table": table}
+    entries["homogeneous"] = file.grips == "none"
     with source.at("fibres", table=("fibres",)):
         if isinstance(file.fibres, Uniform):
             fibres, sheets, angles = file.fibres.repeated(len(states.free))

@@ -11,8 +11,8 @@ from emulator.core.errors import InputError
 from emulator.geometry.fibres import across
 from emulator.geometry.refinement import Refinement, refined
 from emulator.scenes.fibre_rules import FibreRule
-from emulator.scenes.scene import Scene
-from emulator.scenes.specimen import Specimen, with_mesh
+from emulator.scenes.scene import Scene, with_mesh
+from emulator.scenes.specimen import Specimen
 
 FINER = "finer"
 """The name under which the origin of a scene says that its mesh was refined."""

@@ -43,6 +43,7 @@ _LEFT_OUT = frozenset(
         "name",  # only in messages
         "origin",  # how the scene was made, which a file need not know
         "fibre_rule",  # its directions on this mesh are in "fibres"
+        "table",  # the text that a specimen's states were read from
         "homogeneous",  # what a user says of a specimen's states, which are that anyway
     }
 )

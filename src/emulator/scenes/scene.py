@@ -172,6 +172,16 @@ class Scene(SceneData):
         ]
 
 
+def with_mesh(problem: ForwardProblem) -> Scene:
+    """Return ``problem`` if it is a scene; :class:`InputError` for a specimen."""
+    if not isinstance(problem, Scene):
+        raise InputError(
+            f"scene '{problem.name}' is a specimen, which has no mesh; em.homogeneous solves it, "
+            "and simulate, infer, certify and report take it"
+        )
+    return problem
+
+
 def all_nodes(problem: ForwardProblem) -> np.ndarray:
     """Return the number of every node of a scene or a specimen, (n,)."""
     return np.arange(problem.node_count)

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.core.cells import PROTOCOL, read_cells
+from emulator.core.cells import PROTOCOL, Cells, read_cells
 from emulator.core.errors import InputError
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws import Law
@@ -31,7 +31,7 @@ from emulator.scenes.forward_problem import ForwardProblem
 from emulator.scenes.grips import Grips
 from emulator.scenes.identity import Identity, described_fields, fingerprint
 from emulator.scenes.parameter_space import Parameter
-from emulator.scenes.scene import Scene
+from emulator.scenes.scene import with_mesh
 from emulator.scenes.states import States, motion_columns, pull_columns, states, with_unit
 from emulator.scenes.tissue import FibreAngles, Tissue, stiffness_of, turned
 from emulator.scenes.tube import Tube
@@ -58,6 +58,7 @@ class Specimen(ForwardProblem):
     tube : the sector whose wall's points the states are (:mod:`emulator.scenes.tube`). With several
         layers, region k is layer k from the inside.
     grips : how the piece was held (:mod:`emulator.scenes.gripped`).
+    table : the table that the states were read from.
     homogeneous : whether somebody said that a piece without ``grips`` deforms evenly. It changes no
         solution: verdicts name the assumption, and by whom it is made.
     """
@@ -74,6 +75,7 @@ class Specimen(ForwardProblem):
     angles: tuple[FibreAngles, ...] = ()
     tube: Tube | None = None
     grips: Grips | None = None
+    table: Cells | None = None
     homogeneous: bool = False
 
     def __post_init__(self) -> None:
@@ -170,16 +172,6 @@ def require_specimen(problem: ForwardProblem) -> Specimen:
     return problem
 
 
-def with_mesh(problem: ForwardProblem) -> Scene:
-    """Return ``problem`` if it is a scene; :class:`InputError` for a specimen."""
-    if not isinstance(problem, Scene):
-        raise InputError(
-            f"scene '{problem.name}' is a specimen, which has no mesh; em.homogeneous solves it, "
-            "and simulate, infer, certify and report take it"
-        )
-    return problem
-
-
 def states_in(
     columns: Mapping[str, Any],
     protocols: list[str] | None = None,
@@ -192,9 +184,10 @@ def states_in(
     return read(columns, protocols, ordered=ordered)
 
 
-def read_states(path: Path, tube: Tube | None = None) -> States:
+def read_states(table: Path | Cells, tube: Tube | None = None) -> States:
     """Return the states of a table's rows; the column ``protocol`` names their tests."""
-    cells = read_cells(path)
+    cells = table if isinstance(table, Cells) else read_cells(table)
+    path = cells.path
     moving = motion_columns if tube is None else tube_columns
     words, rows = moving(cells.words), list(cells.rows)
     if tube is not None and (pulls := pull_columns(cells.words)):

@@ -22,8 +22,7 @@ from emulator.core.errors import InputError
 from emulator.fem.assembly import System
 from emulator.fem.energy import volume_ratio
 from emulator.fem.simulator import Simulator
-from emulator.scenes.scene import Scene, all_nodes, check_nodes
-from emulator.scenes.specimen import with_mesh
+from emulator.scenes.scene import Scene, all_nodes, check_nodes, with_mesh
 from emulator.surrogates.emulator import EMULATOR
 from emulator.surrogates.protocol import (
     ForwardKind,

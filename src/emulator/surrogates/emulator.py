@@ -34,8 +34,7 @@ from emulator.core.errors import InputError, look_up
 from emulator.core.rooms import offered
 from emulator.core.store import inside, read_arrays, read_json, save_arrays, write_json
 from emulator.fem.reactions import SupportForce
-from emulator.scenes.scene import Scene, all_nodes, check_nodes
-from emulator.scenes.specimen import with_mesh
+from emulator.scenes.scene import Scene, all_nodes, check_nodes, with_mesh
 from emulator.surrogates.coarse import Coarse
 from emulator.surrogates.discrepancy import Discrepancy
 from emulator.surrogates.network import Network

@@ -19,8 +19,7 @@ from emulator.core.errors import InputError
 from emulator.fem.simulator import Simulator
 from emulator.fem.solution import EquilibriumSolver
 from emulator.scenes.forward_problem import ForwardProblem
-from emulator.scenes.scene import check_nodes
-from emulator.scenes.specimen import with_mesh
+from emulator.scenes.scene import check_nodes, with_mesh
 
 
 class Prediction(NamedTuple):

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 import calibrate as cal
 import emulator as em
 from calibrate.cli import main
+from calibrate.measurements.data import read_measurements
 from calibrate.project.experiment import read_experiment
 from calibrate.project.problem import simulator_of
 from calibrate.project.specimen import draft_specimen
@@ -46,6 +48,42 @@ def test_files_are_written_and_say_what_was_guessed(tmp_path):
     assert problem.run.forward == "incompressible"
     with pytest.raises(InputError, match="is there already"):
         draft_specimen(tmp_path / "test.csv", tmp_path / "test.toml")
+
+
+def test_states_and_stresses_come_of_one_reading_of_the_table(tmp_path, monkeypatch):
+    (tmp_path / "test.csv").write_text(table())
+    readings, read_text = [], Path.read_text
+
+    def counted(path, *arguments, **words):
+        readings.append(path.name)
+        return read_text(path, *arguments, **words)
+
+    monkeypatch.setattr(Path, "read_text", counted)
+    draft = draft_specimen(tmp_path / "test.csv", tmp_path / "test.toml")
+    assert readings.count("test.csv") == 2  # for the files, and to check what was written
+    readings.clear()
+    problem = read_experiment(draft.path)
+    assert readings.count("test.csv") == 1
+    # A table that is edited afterwards is read again.
+    (tmp_path / "test.csv").write_text(table(noise=0.1))
+    _, data, _ = read_measurements(problem.scene, tmp_path / "test.csv")
+    assert np.abs(data["stress"] - problem.data["stress"]).max() > 0.01
+
+
+def test_a_specimen_is_simulated_state_by_state(tmp_path, monkeypatch, capsys):
+    (tmp_path / "test.csv").write_text(table())
+    monkeypatch.chdir(tmp_path)
+    assert main(["init", "test.csv", "--law", "holzapfel_ogden_isotropic"]) == 0
+    capsys.readouterr()
+    words = ["simulate", "test_scene.toml", "--theta", f"a={A}", f"b={B}"]
+    assert main([*words, "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["status"] == "converged"
+    data = read_experiment(tmp_path / "test.toml").data["stress"]
+    P = np.diagonal(np.array(result["stresses_kPa"]), axis1=1, axis2=2)
+    np.testing.assert_allclose(P[:, :2], data, atol=0.02 * data.max())  # kappa is finite
+    assert main([*words, "--out", "test.vtu"]) == 2
+    assert "is a specimen, which has no mesh" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

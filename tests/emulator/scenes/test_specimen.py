@@ -10,7 +10,8 @@ from emulator.catalogue import find_problem
 from emulator.core.errors import InputError
 from emulator.scenes.file import read_scene
 from emulator.scenes.grips import Grips
-from emulator.scenes.specimen import read_states, require_specimen, specimen, with_mesh
+from emulator.scenes.scene import with_mesh
+from emulator.scenes.specimen import read_states, require_specimen, specimen
 from emulator.scenes.states import states, with_unit
 
 NAN = np.nan

@@ -129,7 +129,7 @@ def _klotz(model: Model, seed: int) -> KlotzBand | None:
     from calibrate.measurements.klotz import klotz_of
     from calibrate.measurements.volume import pressure_volume
     from calibrate.posterior.predictions import klotz_band
-    from emulator.scenes.specimen import with_mesh
+    from emulator.scenes.scene import with_mesh
     from emulator.surrogates.fem import FEMForward
 
     if isinstance(model.forward, FEMForward) or (curve := pressure_volume(model.full)) is None:

@@ -58,7 +58,8 @@ def simulate(arguments: Namespace) -> Answer:
     from emulator.fem.fields import element_fields
     from emulator.fem.reactions import supported_sets
     from emulator.geometry.io import write_solution
-    from emulator.scenes.specimen import Specimen, with_mesh
+    from emulator.scenes.scene import with_mesh
+    from emulator.scenes.specimen import Specimen
 
     problem = words.problem_of(arguments)
     if isinstance(problem, Specimen) and not arguments.out:

@@ -69,7 +69,8 @@ def _add_plan(parser: ArgumentParser) -> None:
 def train(arguments: Namespace) -> Answer:
     """Train and write an emulator."""
     from calibrate.provenance import hardware, versions
-    from emulator.scenes.specimen import Specimen, with_mesh
+    from emulator.scenes.scene import with_mesh
+    from emulator.scenes.specimen import Specimen
     from emulator.surrogates import load, save_emulator
     from emulator.training import remove_checkpoint
     from emulator.training import train as train_emulator

@@ -42,8 +42,7 @@ from emulator.fem.campaign.campaign import Field, Runs, StoredRuns
 from emulator.fem.campaign.workers import Row, Solver
 from emulator.fem.simulator import Simulator
 from emulator.fem.solution import Status
-from emulator.scenes.scene import Scene
-from emulator.scenes.specimen import with_mesh
+from emulator.scenes.scene import Scene, with_mesh
 
 _MISSING = -1
 _FORMAT = 1

@@ -28,7 +28,7 @@ from emulator.fem.energy import potential_energy
 from emulator.fem.linear.suitesparse import keeping_factors
 from emulator.fem.simulator import Simulator
 from emulator.fem.solution import EquilibriumSolver, Solution, Status
-from emulator.scenes.specimen import with_mesh
+from emulator.scenes.scene import with_mesh
 
 _BYTES_A_NODE = 100_000  # memory of a concurrent solve; 54 000 measured at 33 605 nodes
 _MEMORY_SHARE = 0.5  # share of the machine's memory that solves may take
