@@ -84,37 +84,13 @@ def draft_specimen(
         raise InputError(f"data file {table} does not exist")
     cells = read_cells(table)
     given = read_states(cells, tube)
-    count = len(given.free) // (tube.size if tube else 1)
     largest, slope = _size(cells, given, tube)
     moved = (np.diagonal(given.gradients, axis1=1, axis2=2) != 0.0) | (given.pulls != 0.0)
     axes = [axis for axis, own in zip(AXES, moved.T, strict=True) if own.any()]
     chosen = "holzapfel_gasser_ogden" if len(axes) > 1 else "holzapfel_ogden_isotropic"
     material = find_law(law or chosen)
-    notes = [
-        f"{count} states in {_tests(given)}",
-        f"law {material.name}" + ("" if law else ": a guess, give --law NAME"),
-        *(
-            f"{name} reaches {part.at_rest + most:.3g} {part.unit}".removesuffix(" 1")
-            for name, (part, most) in largest.items()
-        ),
-        f"ranges of moduli follow from a stiffness of {slope:.3g} kPa",
-        *([] if tube else ['grips = "none": stresses are taken to be even']),
-        "incompressible, --forward homogeneous takes the law's kappa; FEM, which checks, takes it, "
-        "too",
-        *(
-            f"errors along a curve of {name} correlate over {part.usual_length[0]:g} "
-            f"{part.usual_length[1]}, their sds are inferred"
-            for name, (part, _) in largest.items()
-        ),
-    ]
-    of_tube = (TubePressure.column, TubeForce.column)
-    names = {word: with_unit(word) for word in cells.words}
-    pulls = pull_columns(names).values()
-    measured = [w for w, (n, _) in names.items() if is_stress(w) or w in pulls or n in of_tube]
-    if bare := [w for w in measured if not names[w][1]]:
-        notes.insert(1, f"{', '.join(bare)} without a unit: kPa, forces mN; others in brackets")
-    if cells.unloading:
-        notes.insert(1, f"{cells.unloading} rows of unloading are left out")
+    of_law = f"law {material.name}" + ("" if law else ": a guess, give --law NAME")
+    notes = _notes(cells, given, of_law, largest, slope, tube)
     folder = scene_path.resolve().parent
     source = table.resolve()
     name = source.relative_to(folder) if source.is_relative_to(folder) else source
@@ -131,6 +107,37 @@ def draft_specimen(
         raise
     out.write_text(_experiment_text(scene_path.name, name.as_posix(), largest, notes), "utf-8")
     return SpecimenDraft(out, scene_path, scene, tuple(notes))
+
+
+def _notes(
+    cells: Cells, given: States, of_law: str, largest: _Sizes, slope: float, tube: Tube | None
+) -> list[str]:
+    """Return a sentence for each thing that was read or guessed; ``of_law`` is that on the law."""
+    notes = [
+        f"{len(given.free) // (tube.size if tube else 1)} states in {_tests(given)}",
+        of_law,
+        *(
+            f"{name} reaches {part.at_rest + most:.3g} {part.unit}".removesuffix(" 1")
+            for name, (part, most) in largest.items()
+        ),
+        f"ranges of moduli follow from a stiffness of {slope:.3g} kPa",
+        *([] if tube else ['grips = "none": stresses are taken to be even']),
+        "incompressible, --forward homogeneous takes the law's kappa; the certificate takes it, too",
+        *(
+            f"errors along a curve of {name} correlate over {part.usual_length[0]:g} "
+            f"{part.usual_length[1]}, their sds are inferred"
+            for name, (part, _) in largest.items()
+        ),
+    ]
+    of_tube = (TubePressure.column, TubeForce.column)
+    names = {word: with_unit(word) for word in cells.words}
+    pulls = pull_columns(names).values()
+    measured = [w for w, (n, _) in names.items() if is_stress(w) or w in pulls or n in of_tube]
+    if bare := [w for w in measured if not names[w][1]]:
+        notes.insert(1, f"{', '.join(bare)} without a unit: kPa, forces mN; others in brackets")
+    if cells.unloading:
+        notes.insert(1, f"{cells.unloading} rows of unloading are left out")
+    return notes
 
 
 def _tests(given: States) -> str:

@@ -31,6 +31,8 @@ if TYPE_CHECKING:  # pydantic is imported when a scene file is read, not with th
     from emulator.scenes.file_schema import Plane, SceneFile
 
 Regions = np.ndarray | None
+Entries = dict[str, Any]
+"""Fields of a scene or a specimen, by name."""
 
 # A node this far from a plane, as a fraction of the body's size, is on it.
 _ON_PLANE = 1e-8
@@ -57,7 +59,7 @@ def read_scene(path: str | Path) -> Scene | Specimen:
     file = parse(SceneFile, source)
     with source.at("law"):
         law = find_law(file.law)
-    entries: dict[str, Any] = {
+    entries: Entries = {
         "name": path.stem,
         "law": law,
         "origin": {"scene": "file", "path": str(path.resolve())},
@@ -74,10 +76,6 @@ def read_scene(path: str | Path) -> Scene | Specimen:
         return make(parameters=tuple(parameters), **entries, **of_body)
     except InputError as error:
         raise source.error(str(error), _quantity_in(str(error), file)) from error
-
-
-Entries = dict[str, Any]
-"""Fields of a scene or a specimen, by name."""
 
 
 def _on_mesh(

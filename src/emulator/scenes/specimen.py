@@ -23,7 +23,7 @@ import numpy as np
 
 from emulator.core.cells import PROTOCOL, Cells, read_cells
 from emulator.core.errors import InputError
-from emulator.geometry.mesh import Mesh
+from emulator.geometry.mesh import Mesh, frozen_array
 from emulator.mechanics.laws import Law
 from emulator.mechanics.laws.law import law_identity
 from emulator.scenes.fibre_rules import FibreRule
@@ -79,7 +79,11 @@ class Specimen(ForwardProblem):
     homogeneous: bool = False
 
     def __post_init__(self) -> None:
-        count = len(self.states.free)
+        H, free, pulls, tests = self.states
+        count = len(free)
+        rows = MappingProxyType({name: frozen_array(k, int) for name, k in tests.items()})
+        states = States(frozen_array(H), frozen_array(free, bool), frozen_array(pulls), rows)
+        object.__setattr__(self, "states", states)
         for name in ("constants", "origin"):
             object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
         for name in ("fibres", "sheets"):
