@@ -122,7 +122,7 @@ def _notes(
         ),
         f"ranges of moduli follow from a stiffness of {slope:.3g} kPa",
         *([] if tube else ['grips = "none": stresses are taken to be even']),
-        "incompressible, --forward homogeneous takes the law's kappa; the certificate takes it, too",
+        "incompressible, --forward homogeneous takes the law's kappa; certificates take it, too",
         *(
             f"errors along a curve of {name} correlate over {part.usual_length[0]:g} "
             f"{part.usual_length[1]}, their sds are inferred"
