@@ -22,7 +22,17 @@ ROOMS = {
         "emulator.fem.linear_response",
         *(f"emulator.training.{name}" for name in ("physics", "sweeps", "paper")),
     ),
-    "fields": ("calibrate.measurements.frames", "calibrate.cli.commands.frames"),
+    "specimens": (
+        "emulator.specimens",
+        *(f"calibrate.measurements.{name}" for name in ("specimens", "stress", "stretch", "tube")),
+        "calibrate.statistical_model.gripped_fem",
+        "calibrate.project.specimen",
+    ),
+    "fields": (
+        "calibrate.measurements.frames",
+        "calibrate.measurements.full_field",
+        "calibrate.cli.commands.frames",
+    ),
     "pages": ("calibrate.report", "calibrate.figures", "calibrate.explorer"),
     "serving": ("calibrate.um_bridge", "calibrate.local_server", "calibrate.cli.commands.serving"),
     "analyses": ("calibrate.analysis", "calibrate.cli.commands.analyses"),
@@ -36,9 +46,10 @@ ROOMS = {
 """The modules and packages of each room."""
 
 NEIGHBOURS = {
-    "analyses": {"released", "pages"},
-    "fields": {"hearts"},
-    "pages": {"analyses", "populations", "serving"},
+    "analyses": {"released", "pages", "specimens"},
+    "fields": {"hearts", "specimens"},
+    "pages": {"analyses", "populations", "serving", "specimens"},
+    "released": {"specimens"},
     "serving": {"pages"},
     "populations": {"pages"},
 }

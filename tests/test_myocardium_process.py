@@ -8,7 +8,7 @@ from studies.sheep_myocardium import cube, process
 
 import calibrate as cal
 import emulator as em
-from emulator.scenes.states import states
+from emulator.specimens.states import states
 
 pytestmark = pytest.mark.slow
 

@@ -12,8 +12,6 @@ from .measurements import (
     MeasuredParameter,
     Reaction,
     Scalar,
-    TubeForce,
-    TubePressure,
     landmarks,
     length_between,
     nodal_displacements,
@@ -22,12 +20,13 @@ from .measurements import (
     segment_strains,
     spread_landmarks,
     strains,
-    stresses,
-    stretches,
     surface_distances,
     surface_points,
 )
 from .measurements.full_field import FullField, field_data, read_full_field
+from .measurements.stress import stresses
+from .measurements.stretch import stretches
+from .measurements.tube import TubeForce, TubePressure
 from .model_error import placement, rigid_motion
 from .noise import CorrelatedNoise, GaussianNoise, StudentTNoise
 from .population import Hierarchy, hierarchy, read_hierarchy

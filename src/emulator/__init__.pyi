@@ -24,12 +24,12 @@ from .mechanics.laws import find_law
 from .scenes import Parameter, Scene, Support, loads, supports
 from .scenes.draft import draft_scene
 from .scenes.finer import finer
-from .scenes.specimen import specimen
-from .scenes.tube import Tube
+from .specimens.homogeneous import homogeneous
+from .specimens.specimen import specimen
+from .specimens.tube import Tube
 from .surrogates import Emulator, load, save_emulator, shipped
 from .surrogates.corrected import corrected
 from .surrogates.fem import FEMForward, fem_forward
-from .surrogates.homogeneous import homogeneous
 from .surrogates.pod_gp import fit_reduced
 from .surrogates.protocol import ForwardMap, Prediction
 from .surrogates.released_network import released_network

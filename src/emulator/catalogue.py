@@ -10,8 +10,8 @@ from emulator.core.errors import InputError
 from emulator.scenes.built_in import BUILT_IN
 from emulator.scenes.file import read_scene
 from emulator.scenes.finer import CHANGES, FINER, Finer, finer
+from emulator.scenes.forward_problem import ForwardProblem
 from emulator.scenes.scene import Scene, with_mesh
-from emulator.scenes.specimen import Specimen
 
 _RELEASED = "published:"
 
@@ -21,7 +21,7 @@ def find_scene(name: str, root: str | Path | None = None) -> Scene:
     return with_mesh(find_problem(name, root))
 
 
-def find_problem(name: str, root: str | Path | None = None) -> Scene | Specimen:
+def find_problem(name: str, root: str | Path | None = None) -> ForwardProblem:
     """Return the scene or the specimen called ``name``.
 
     Parameters

@@ -22,10 +22,10 @@ import calibrate as cal
 import emulator as em
 from calibrate.figures import BLUE, ORANGE, pyplot
 from emulator.fem.campaign.designs import sobol
-from emulator.scenes.grips import Grips, GripStresses
-from emulator.scenes.specimen import Specimen, specimen
-from emulator.scenes.states import states
-from emulator.surrogates.gripped import GrippedSpecimen, learn_grips
+from emulator.specimens.gripped import GrippedSpecimen, learn_grips
+from emulator.specimens.grips import Grips, GripStresses
+from emulator.specimens.specimen import Specimen, specimen
+from emulator.specimens.states import states
 
 HERE = Path(__file__).parent
 SEED = 5

@@ -22,8 +22,8 @@ import emulator as em
 from calibrate.figures import BLUE, ORANGE, pyplot
 from calibrate.posterior.predictions import replicates
 from emulator.core.errors import InputError
-from emulator.scenes.grips import Grips
-from emulator.scenes.states import states
+from emulator.specimens.grips import Grips
+from emulator.specimens.states import states
 
 HERE = Path(__file__).parent
 SEED = 4

@@ -22,7 +22,7 @@ import calibrate as cal
 import emulator as em
 from calibrate.figures import BLUE, pyplot
 from emulator.core.errors import InputError
-from emulator.scenes.states import AXES, States, states
+from emulator.specimens.states import AXES, States, states
 
 HERE = Path(__file__).parent
 SEED = 3

@@ -17,7 +17,7 @@ two angles miss theirs by 3 degrees (sd), by the rule of five nodes that is exac
 
 Without it, how far FEM is from the formula has a kink there, at another angle for each point.
 
-Its stresses are those of :func:`emulator.surrogates.homogeneous.homogeneous_stresses` in the same
+Its stresses are those of :func:`emulator.specimens.homogeneous.homogeneous_stresses` in the same
 states (tests/test_myocardium_process.py). They are not taken from there, since a specimen is one
 program a heart, and here angles are unknowns and amounts are arrays, so that one serves all hearts.
 """

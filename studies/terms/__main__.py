@@ -20,8 +20,8 @@ import emulator as em
 from calibrate.analysis.terms import find_terms
 from calibrate.figures import BLUE, VERMILION, pyplot
 from emulator.mechanics.laws.invariant_terms import TERMS
-from emulator.scenes.specimen import specimen
-from emulator.scenes.states import states
+from emulator.specimens.specimen import specimen
+from emulator.specimens.states import states
 
 HERE = Path(__file__).parent
 SEED = 11

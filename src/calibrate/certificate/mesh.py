@@ -2,7 +2,7 @@ r"""What a finer mesh would change of a posterior, or the grips of a specimen.
 
 FEM is solved at a few points of the posterior, on its mesh and on the next finer one
 (:mod:`emulator.accuracy.mesh_error`). For a specimen of homogeneous states the finer one is the
-piece between its grips (:mod:`emulator.surrogates.gripped`). The difference :math:`D` in the data
+piece between its grips (:mod:`emulator.specimens.gripped`). The difference :math:`D` in the data
 varies little over a posterior, and a Gaussian process of theta continues it
 (:mod:`calibrate.statistical_model.predictive`). Added to the map's error on the mesh, it gives a
 posterior under the finer mesh's FEM, and the pool follows that posterior. The change is from the
@@ -43,12 +43,11 @@ from calibrate.statistical_model.predictive import (
 from emulator.accuracy.mesh_error import MeshErrorEstimate
 from emulator.core.display import counting
 from emulator.core.errors import InputError, SolverError
+from emulator.core.rooms import offered
 from emulator.fem import Simulator
 from emulator.fem.campaign import in_order
 from emulator.fem.solution import EquilibriumSolver
 from emulator.scenes.scene import Scene
-from emulator.scenes.specimen import Specimen
-from emulator.surrogates.homogeneous import Homogeneous
 
 MOST_RUNS = 30
 """Default of the largest number of solves on the finer mesh."""
@@ -98,12 +97,14 @@ def mesh_change(
     predictive = pool.predictive
     if count == 0:
         return MeshChange(why="not asked")
-    if not isinstance(simulator, Simulator | Homogeneous):
-        return MeshChange(why="the simulator is not FEM's")
     scene = simulator.scene
-    if isinstance(scene, Specimen) and scene.grips is None and scene.tube is None:
-        said = SAID_HOMOGENEOUS if scene.homogeneous else NOBODY_SAID
-        return MeshChange(why="its states are homogeneous on any mesh", homogeneous=said)
+    if not isinstance(scene, Scene):
+        (is_said_even,) = offered("calibrate.statistical_model.gripped_fem", "is_said_even")
+        if (even := is_said_even(scene)) is not None:
+            said = SAID_HOMOGENEOUS if even else NOBODY_SAID
+            return MeshChange(why="its states are homogeneous on any mesh", homogeneous=said)
+    elif not isinstance(simulator, Simulator):
+        return MeshChange(why="the simulator is not FEM's")
     try:
         finer = finer_fem(predictive.model, simulator)
     except InputError as reason:
@@ -127,7 +128,7 @@ def mesh_change(
         failed=change.failed * states,
         nodes=finer.nodes,
         linear=isinstance(scene, Scene) and scene.mesh.order == 1,
-        gripped=isinstance(scene, Specimen),
+        gripped=not isinstance(scene, Scene),
     )
 
 

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
     from emulator.scenes.forward_problem import ForwardProblem
     from emulator.scenes.scene import Scene
-    from emulator.scenes.specimen import Specimen
 
 
 class _Once(Action):
@@ -168,7 +167,7 @@ def scene_words(arguments: Namespace) -> tuple[str, str | None]:
     return arguments.scene, arguments.root
 
 
-def problem_of(arguments: Namespace) -> Scene | Specimen:
+def problem_of(arguments: Namespace) -> ForwardProblem:
     """Return the scene or the specimen that :func:`add_scene` read."""
     from emulator.catalogue import find_problem
 

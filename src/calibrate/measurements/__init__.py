@@ -37,8 +37,6 @@ from calibrate.measurements.parameter import MeasuredParameter
 from calibrate.measurements.points import DISPLACEMENT
 from calibrate.measurements.reaction import Reaction
 from calibrate.measurements.strain import PointStrain, SegmentStrain, segment_strains, strains
-from calibrate.measurements.stress import Stress, stresses
-from calibrate.measurements.stretch import Stretch, stretches
 from calibrate.measurements.surface import (
     RigidMarkers,
     SurfacePoints,
@@ -47,11 +45,11 @@ from calibrate.measurements.surface import (
     surface_distances,
     surface_points,
 )
-from calibrate.measurements.tube import TubeForce, TubePressure
 from calibrate.measurements.volume import CavityVolume
 from calibrate.measurements.words import from_json, parse
 from calibrate.state_names import in_state, split
 from emulator.core.errors import InputError, look_up
+from emulator.core.rooms import offered
 from emulator.scenes.forward_problem import ForwardProblem
 from emulator.scenes.scene import with_mesh
 
@@ -69,10 +67,10 @@ OBSERVATIONS: dict[str, type[Observation]] = {
         KlotzVolume,
         Length,
         Reaction,
-        Stress,
-        Stretch,
-        TubePressure,
-        TubeForce,
+        *offered("calibrate.measurements.stress", "Stress"),
+        *offered("calibrate.measurements.stretch", "Stretch"),
+        *offered("calibrate.measurements.tube", "TubePressure"),
+        *offered("calibrate.measurements.tube", "TubeForce"),
         MeasuredParameter,
     )
 }
@@ -89,10 +87,6 @@ __all__ = [
     "Observations",
     "Reaction",
     "Scalar",
-    "Stress",
-    "Stretch",
-    "TubeForce",
-    "TubePressure",
     "landmarks",
     "leave_out_missing",
     "length_between",
@@ -107,8 +101,6 @@ __all__ = [
     "spread_nodes",
     "spread_on_surface",
     "strains",
-    "stresses",
-    "stretches",
     "surface_distances",
     "surface_points",
 ]

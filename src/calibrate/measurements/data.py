@@ -38,7 +38,6 @@ from calibrate.measurements.observation import (
     check_values,
 )
 from calibrate.measurements.points import PointObservation
-from calibrate.measurements.specimens import check_tests
 from calibrate.measurements.tables import (
     KNOWN,
     DataTable,
@@ -51,6 +50,7 @@ from calibrate.measurements.words import names_of, parse
 from calibrate.state_names import in_state, split
 from emulator.core.cells import SPREADSHEETS, TEXT, Cells
 from emulator.core.errors import InputError
+from emulator.core.rooms import offered
 from emulator.scenes.forward_problem import ForwardProblem
 
 _OTHER_SPREADSHEETS = (".xls", ".ods")
@@ -118,7 +118,8 @@ def _observed(
             where = f", state '{state}'" if state else ""
             raise InputError(f"data file {file.path}{where}: {error}") from error
     try:
-        check_tests(observed)
+        for check_tests in offered("calibrate.measurements.specimens", "check_tests"):
+            check_tests(observed)
     except InputError as error:
         raise InputError(f"data file {file.path}: {error}") from error
     return observed

@@ -25,7 +25,7 @@ from calibrate.state_names import in_state
 from emulator.core.cells import Cells, read_cells
 from emulator.core.errors import InputError
 from emulator.scenes.scene import Scene
-from emulator.scenes.states import falls
+from emulator.specimens.states import falls
 
 _FOLLOWS = (
     0.9  # correlation of the points' mean motion with what pulls them, where frames are right

@@ -17,8 +17,8 @@ from calibrate.measurements.observation import Block, DataField, derive
 from calibrate.measurements.points import PointObservation
 from emulator.core.errors import InputError
 from emulator.scenes.scene import all_nodes
-from emulator.scenes.specimen import Specimen, require_specimen, states_in
-from emulator.scenes.states import APPLIED, AXES, States
+from emulator.specimens.specimen import Specimen, require_specimen, states_in
+from emulator.specimens.states import APPLIED, AXES, States
 
 _APART = 1e3  # distance between the points of two tests, whose errors do not correlate
 _ROUND_OFF = 1e-6

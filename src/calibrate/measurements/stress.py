@@ -1,8 +1,8 @@
 r"""Stresses of a specimen: the curves of a tensile, biaxial or shear test.
 
 All measures follow from the first Piola-Kirchhoff stress P of a state of gradient F
-(:func:`~emulator.surrogates.homogeneous.homogeneous_stresses`) with what grips add to it
-(:mod:`emulator.surrogates.gripped`),
+(:func:`~emulator.specimens.homogeneous.homogeneous_stresses`) with what grips add to it
+(:mod:`emulator.specimens.gripped`),
 
 .. math:: \sigma = P F^T / J, \qquad S = F^{-1} P .
 
@@ -35,17 +35,12 @@ import numpy as np
 from calibrate.measurements.observation import DataField, Layout, derive
 from calibrate.measurements.specimens import Components
 from emulator.core.errors import InputError
-from emulator.core.units import IN_KPA, IN_MM2, IN_MN, factor
+from emulator.core.units import IN_KPA, IN_MM2, IN_MN, factor, with_unit
 from emulator.mechanics.kinematics import cofactor, determinant
-from emulator.scenes.specimen import Specimen
-from emulator.scenes.states import (
-    AXES,
-    motion_columns,
-    pull_columns,
-    with_unit,
-)
-from emulator.surrogates.gripped import added, gripped_stresses
-from emulator.surrogates.homogeneous import homogeneous_stresses
+from emulator.specimens.gripped import added, gripped_stresses
+from emulator.specimens.homogeneous import homogeneous_stresses
+from emulator.specimens.specimen import Specimen
+from emulator.specimens.states import AXES, motion_columns, pull_columns
 
 _COMPONENT = re.compile(r"(stress|cauchy|second)_([xyz])([xyz])?")
 _PULL = re.compile(r"force(_[xyz][xyz]?)")

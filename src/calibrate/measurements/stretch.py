@@ -1,10 +1,10 @@
 r"""Stretches of a specimen under load control: what a machine that prescribes stresses measures.
 
 Where a table has ``applied_x``, the machine pulls along x with this first Piola-Kirchhoff stress
-(:mod:`emulator.scenes.states`), and the column ``stretch_x``, ``strain_x`` or ``green_x`` is data:
-:math:`\lambda = F_{xx}` of the equilibrium. In states without a pull along x it is prescribed, and
-the data are missing. Errors correlate along a test's curve by the way of the pull, as a share of
-the test's largest.
+(:mod:`emulator.specimens.states`), and the column ``stretch_x``, ``strain_x`` or ``green_x`` is
+data: :math:`\lambda = F_{xx}` of the equilibrium. In states without a pull along x it is
+prescribed, and the data are missing. Errors correlate along a test's curve by the way of the pull,
+as a share of the test's largest.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ import numpy as np
 
 from calibrate.measurements.observation import DataField, Layout
 from calibrate.measurements.specimens import Components
-from emulator.scenes.specimen import Specimen
-from emulator.scenes.states import (
+from emulator.specimens.specimen import Specimen
+from emulator.specimens.states import (
     APPLIED,
     AXES,
     components_of,

@@ -21,8 +21,7 @@ from calibrate.state_names import in_state, split, states_of
 from emulator.core import store
 from emulator.core.cells import TEXT, Cells, read_cells
 from emulator.core.errors import InputError
-from emulator.core.units import IN_KPA, IN_ML, IN_MM, factor
-from emulator.scenes.states import with_unit
+from emulator.core.units import IN_KPA, IN_ML, IN_MM, factor, with_unit
 
 STATE = "state"
 """Column of a CSV file that names the load state of a row."""

@@ -1,6 +1,6 @@
 r"""What is measured of a tube: the pressure inside, and the force along it.
 
-Both are integrals of the wall's stresses (:mod:`emulator.scenes.tube`), with
+Both are integrals of the wall's stresses (:mod:`emulator.specimens.tube`), with
 :math:`\hat\sigma = P F^T / J`. Columns are ``pressure`` and ``force_axial``, the force besides that
 of the pressure on closed ends; units as in ``pressure [mmHg]``, kPa and mN without one.
 """
@@ -18,12 +18,11 @@ import numpy as np
 from calibrate.measurements.observation import DataField, Layout
 from calibrate.measurements.specimens import SpecimenCurves
 from emulator.core.errors import InputError
-from emulator.core.units import IN_KPA, IN_MN, factor
+from emulator.core.units import IN_KPA, IN_MN, factor, with_unit
 from emulator.mechanics.kinematics import determinant
-from emulator.scenes.specimen import Specimen
-from emulator.scenes.states import with_unit
-from emulator.scenes.tube import Tube, motion_columns
-from emulator.surrogates.homogeneous import homogeneous_stresses
+from emulator.specimens.homogeneous import homogeneous_stresses
+from emulator.specimens.specimen import Specimen
+from emulator.specimens.tube import Tube, motion_columns
 
 
 @dataclass(frozen=True, eq=False)

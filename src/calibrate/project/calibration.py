@@ -31,8 +31,8 @@ from emulator.core.display import Stages
 from emulator.core.errors import InputError
 from emulator.core.store import write_json
 from emulator.fem import Simulator
+from emulator.scenes.scene import Scene
 from emulator.surrogates.fem import FEMForward
-from emulator.surrogates.homogeneous import Homogeneous
 
 NOT_CERTIFIED = "not certified"
 SECONDS = "seconds"  # attribute of a posterior: the seconds of each stage, as JSON
@@ -86,8 +86,9 @@ def infer(
                 checkpoint=None if target is None else target / SAMPLING,
             )
         errors = NOT_ASKED
-        # The states of a specimen are solved, not learned.
-        if check_map and not isinstance(model.full, FEMForward | Homogeneous):
+        # The states of a specimen, which has no mesh, are solved, not learned.
+        is_learned = isinstance(problem.scene, Scene) and not isinstance(model.full, FEMForward)
+        if check_map and is_learned:
             with stages("check of the map"):
                 simulator = cast(Simulator, problem.simulator)
                 errors = map_errors(posterior.model, simulator, posterior.draws(), posterior.data)

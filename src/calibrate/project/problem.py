@@ -30,14 +30,13 @@ from calibrate.statistical_model.model import model
 from emulator.catalogue import find_problem
 from emulator.core.errors import InputError
 from emulator.core.kept import kept
+from emulator.core.rooms import offered
 from emulator.fem import NewtonOptions, Simulator
 from emulator.fem.solution import EquilibriumSolver
 from emulator.scenes.forward_problem import ForwardProblem
-from emulator.scenes.scene import with_mesh
-from emulator.scenes.specimen import Specimen
+from emulator.scenes.scene import Scene
 from emulator.surrogates import registry
 from emulator.surrogates.fem import by_solver
-from emulator.surrogates.homogeneous import homogeneous
 from emulator.surrogates.protocol import ForwardMap, Ingredients
 
 
@@ -51,9 +50,10 @@ def simulator_of(scene: ForwardProblem, load_steps: int = 1) -> EquilibriumSolve
     Synthetic data, the forward map, the certificate and the report of a run share one, as they
     share the scene.
     """
-    if isinstance(scene, Specimen):
-        return homogeneous(scene)
-    return Simulator(with_mesh(scene), NewtonOptions.load_steps(load_steps))
+    if isinstance(scene, Scene):
+        return Simulator(scene, NewtonOptions.load_steps(load_steps))
+    (homogeneous,) = offered("emulator.specimens.homogeneous", "homogeneous")
+    return homogeneous(scene)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +121,7 @@ def read_problem(
         table = None
         if scene is None:
             scene = find_problem(run.scene, run.root)
-            table = scene.table if isinstance(scene, Specimen) else None
+            table = scene.table
         if run.is_synthetic:
             names = {**run.known, **run.truth}
             states = tuple(dict.fromkeys(state for _, state in map(split, names) if state))

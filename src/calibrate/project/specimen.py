@@ -14,13 +14,14 @@ from calibrate.measurements.stretch import Stretch
 from calibrate.measurements.tube import TubeForce, TubePressure
 from emulator.core.cells import Cells, read_cells
 from emulator.core.errors import InputError
+from emulator.core.units import with_unit
 from emulator.mechanics.laws import Law, find_law
 from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.file import read_scene
 from emulator.scenes.parameter_space import Parameter
-from emulator.scenes.specimen import Specimen, read_states, require_specimen, specimen
-from emulator.scenes.states import AXES, States, pull_columns, with_unit
-from emulator.scenes.tube import Tube
+from emulator.specimens.specimen import Specimen, read_states, require_specimen, specimen
+from emulator.specimens.states import AXES, States, pull_columns
+from emulator.specimens.tube import Tube
 
 _MODULI = (0.005, 3.0)  # range of a modulus, as a share of the largest stress over its strain
 _EXPONENTS = (0.1, 50.0)
@@ -60,8 +61,8 @@ def draft_specimen(
 
     Parameters
     ----------
-    table : a CSV file or spreadsheet, see :mod:`emulator.scenes.states` and
-        :mod:`calibrate.measurements.stress` for its columns, and :mod:`emulator.scenes.tube` and
+    table : a CSV file or spreadsheet, see :mod:`emulator.specimens.states` and
+        :mod:`calibrate.measurements.stress` for its columns, and :mod:`emulator.specimens.tube` and
         :mod:`calibrate.measurements.tube` for those of a tube.
     out : the experiment file, ``NAME.toml``; the scene is ``NAME_scene.toml`` beside it.
     law : name of the law; by default two families of fibres for tests that pull along two axes,

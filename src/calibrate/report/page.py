@@ -27,7 +27,7 @@ from calibrate.report.parts import Verdict
 from emulator.core.errors import InputError
 from emulator.core.store import read_json, replacing
 from emulator.scenes.scene import with_mesh
-from emulator.scenes.specimen import Specimen
+from emulator.specimens.specimen import Specimen
 
 _SHEET = 0.1  # thickness of a sheet, as a share of its width
 _SHIFTS = {

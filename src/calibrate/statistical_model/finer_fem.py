@@ -14,15 +14,13 @@ from jax.flatten_util import ravel_pytree
 
 from calibrate.measurements import Observations
 from calibrate.measurements.outputs import on_finer
-from calibrate.measurements.specimens import gripped_observations
 from calibrate.statistical_model.model import Model
 from emulator.accuracy.mesh_error import MeshError, MeshErrorEstimate, mesh_error
-from emulator.core.errors import InputError
+from emulator.core.rooms import offered
 from emulator.fem import Simulator
 from emulator.fem.campaign import at_once
 from emulator.fem.solution import EquilibriumSolver
-from emulator.surrogates.gripped import GrippedSpecimen
-from emulator.surrogates.homogeneous import Homogeneous
+from emulator.scenes.scene import Scene
 
 Known = Sequence[MeshErrorEstimate]
 
@@ -74,15 +72,15 @@ def finer_fem(model: Model, simulator: EquilibriumSolver) -> FinerFEM:
         There is none: a specimen without grips, a finer mesh that is too large, a load that it
         cannot have, or an observation that says nothing of grips.
     """
-    if isinstance(simulator, Homogeneous):
-        if simulator.scene.grips is None:
-            raise InputError("the states of a specimen are homogeneous on any mesh")
-        return _Gripped(model, GrippedSpecimen(simulator.scene))
+    if not isinstance(simulator.scene, Scene):
+        (gripped_fem,) = offered("calibrate.statistical_model.gripped_fem", "gripped_fem")
+        return gripped_fem(model, simulator)
     error = mesh_error(cast(Simulator, simulator))
     return _OnFinerMesh(model, error, on_finer(error, model.observe))
 
 
-def _flat(observe: Observations, fields: Sequence[jax.Array], thetas: jax.Array) -> np.ndarray:
+def flat_data(observe: Observations, fields: Sequence[jax.Array], thetas: jax.Array) -> np.ndarray:
+    """Return the data (m,) without noise, raveled, from a field (n, 3) mm of each load state."""
     seen = jnp.stack([u[observe.nodes] for u in fields])
     return np.asarray(ravel_pytree(observe(seen, thetas))[0])
 
@@ -108,8 +106,9 @@ class _OnFinerMesh:
         thetas, own = self.model.states.thetas(draw), list[MeshErrorEstimate]()
         for theta in thetas:
             own.append(self.error(theta, self._start(theta), known=[*known, *own]))
-        fine = _flat(self.observe, [each.fine for each in own], thetas)
-        return MeshPair(fine, _flat(self.model.observe, [each.coarse for each in own], thetas), own)
+        fine = flat_data(self.observe, [each.fine for each in own], thetas)
+        coarse = flat_data(self.model.observe, [each.coarse for each in own], thetas)
+        return MeshPair(fine, coarse, own)
 
     @cached_property
     def _start(self) -> Callable[[jax.Array], jax.Array]:
@@ -117,31 +116,3 @@ class _OnFinerMesh:
 
     def forget(self) -> None:
         self.error.forget()
-
-
-@dataclass(frozen=True, eq=False)
-class _Gripped:
-    """FEM of a specimen between its grips."""
-
-    model: Model
-    gripped: GrippedSpecimen
-
-    @property
-    def nodes(self) -> int:
-        return max(len(piece.mesh.nodes) for piece in self.gripped.simulators)
-
-    @property
-    def workers(self) -> int:
-        return self.gripped.workers
-
-    def __call__(self, draw: Mapping[str, Any], known: Known = ()) -> MeshPair:  # noqa: ARG002
-        """Return the data; what grips add is a share of the homogeneous stresses."""
-        (theta,) = self.model.states.thetas(draw)
-        solution = self.gripped.homogeneous.solve(theta).require_converged("the specimen")
-        fields, thetas = [solution.displacement], theta[None]
-        shares = self.gripped.shares(theta)
-        fine = _flat(gripped_observations(self.model.observe, shares), fields, thetas)
-        return MeshPair(fine, _flat(self.model.observe, fields, thetas))
-
-    def forget(self) -> None:
-        """Do nothing: factors of a piece are small."""

@@ -6,10 +6,12 @@ that begins with a small m is not: ``mPa`` is neither MPa nor Pa.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 
 from emulator.core.errors import InputError
 
+_WITH_UNIT = re.compile(r"([^\[(]*[^\[( ]) *(?:[\[(] *([^\])]*?) *[\])])?")
 KPA_PER_MMHG = 0.133322
 
 IN_KPA = {
@@ -26,6 +28,12 @@ IN_MM2 = {"mm2": 1.0, "cm2": 100.0, "m2": 1e6}
 """Areas."""
 IN_ML = {"mL": 1.0, "ml": 1.0, "cm3": 1.0, "mm3": 1e-3, "uL": 1e-3, "µL": 1e-3, "L": 1e3, "m3": 1e6}
 """Volumes."""
+
+
+def with_unit(word: str) -> tuple[str, str]:
+    """Return the name and the unit of a column such as ``stress_x [kPa]``; no unit is empty."""
+    found = _WITH_UNIT.fullmatch(word.strip())
+    return (found[1], found[2] or "") if found else (word, "")
 
 
 def factor(word: str, unit: str, usual: str, known: Mapping[str, float]) -> float:

@@ -3,28 +3,24 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from emulator.core.cells import read_cells
 from emulator.core.errors import InputError, look_up
+from emulator.core.rooms import offered
 from emulator.geometry.io import Body, read_body, read_mesh, read_modes, read_regions
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.refinement import to_quadratic
 from emulator.geometry.side_by_side import check_name, shifted, side_by_side
 from emulator.mechanics.laws import Law, find_law
-from emulator.scenes.fibre_rules import Uniform
-from emulator.scenes.forward_problem import directions_read
-from emulator.scenes.grips import Grips, GripStresses
+from emulator.scenes.forward_problem import ForwardProblem, directions_read
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
-from emulator.scenes.specimen import Specimen, read_states
 from emulator.scenes.tissue import FibreAngles
-from emulator.scenes.tube import Tube
 
 if TYPE_CHECKING:  # pydantic is imported when a scene file is read, not with the package
     from emulator.core.schema import Source
@@ -36,14 +32,9 @@ Entries = dict[str, Any]
 
 # A node this far from a plane, as a fraction of the body's size, is on it.
 _ON_PLANE = 1e-8
-# Keys of files of a mesh that those of a specimen do not have.
-_OF_MESHES = (
-    "mesh", "bodies", "regions", "stiffness_modes", "supports", "loads", "order", "dilatation",
-    "loaded_by", "node_sets", "facet_sets",
-)  # fmt: skip
 
 
-def read_scene(path: str | Path) -> Scene | Specimen:
+def read_scene(path: str | Path) -> ForwardProblem:
     """Return what a TOML file describes; paths of a mesh and of a table are relative to the file.
 
     Raises
@@ -66,8 +57,7 @@ def read_scene(path: str | Path) -> Scene | Specimen:
         "constants": file.constants,
         "fibre_rule": file.fibres,
     }
-    of_kind = _on_mesh if file.specimen is None else _of_specimen
-    make, of_body = of_kind(path.parent, file, law, source)
+    make, of_body = _kind_of(file, source)(path.parent, file, law, source)
     parameters = []
     for name, entry in file.parameters.items():
         with source.at("parameters", name):
@@ -76,6 +66,15 @@ def read_scene(path: str | Path) -> Scene | Specimen:
         return make(parameters=tuple(parameters), **entries, **of_body)
     except InputError as error:
         raise source.error(str(error), _quantity_in(str(error), file)) from error
+
+
+def _kind_of(file: SceneFile, source: Source) -> Callable[..., tuple[Any, Entries]]:
+    """Return the function that reads what is apart in files of scenes and of specimens."""
+    if file.specimen is None:
+        return _on_mesh
+    for of_specimen in offered("emulator.specimens.file", "of_specimen"):
+        return of_specimen
+    raise source.error("this needs the room 'emulator.specimens'", ("specimen",))
 
 
 def _on_mesh(
@@ -111,39 +110,6 @@ def _on_mesh(
         "dilatation": file.dilatation,
         "loaded_by": file.loaded_by,
     }
-
-
-def _of_specimen(
-    folder: Path, file: SceneFile, law: Law, source: Source
-) -> tuple[type[Specimen], Entries]:
-    """Return the fields of a specimen that its table, its tube and its grips give."""
-    for key in _OF_MESHES:
-        if key in source.data:
-            raise source.error("a specimen has none; it is held and moved by its table", (key,))
-    with source.at("tube", table=("tube",)):
-        if file.tube is not None and file.grips not in (None, "none"):
-            raise InputError("a tube is a specimen without grips")
-        tube = None if file.tube is None else Tube(**file.tube.model_dump())
-    with source.at("specimen"):
-        assert file.specimen is not None
-        table = read_cells(folder / file.specimen)
-        states = read_states(table, tube)
-    entries: Entries = {"states": states, "tube": tube, "table": table}
-    entries["homogeneous"] = file.grips == "none"
-    with source.at("fibres", table=("fibres",)):
-        if isinstance(file.fibres, Uniform):
-            fibres, sheets, angles = file.fibres.repeated(len(states.free))
-            sheets = sheets if law.sheets else None
-            entries |= {"fibres": fibres, "sheets": sheets, "angles": angles}
-        elif file.fibres is not None:
-            raise InputError(f"rule '{file.fibres.rule}' is for a mesh; a specimen has 'uniform'")
-    with source.at("grips", table=("grips",)):
-        if file.grips is not None and file.grips != "none":
-            of_grips = file.grips.model_dump()
-            learned = of_grips.pop("learned")
-            learned = GripStresses.read(folder / learned) if learned else None
-            entries["grips"] = Grips(**of_grips, learned=learned)
-    return Specimen, entries
 
 
 def _one_body(folder: Path, file: SceneFile, law: Law, source: Source) -> tuple[Body, Regions]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 
@@ -11,8 +12,8 @@ from emulator.core.errors import InputError
 from emulator.geometry.fibres import across
 from emulator.geometry.refinement import Refinement, refined
 from emulator.scenes.fibre_rules import FibreRule
+from emulator.scenes.forward_problem import ForwardProblem
 from emulator.scenes.scene import Scene, with_mesh
-from emulator.scenes.specimen import Specimen
 
 FINER = "finer"
 """The name under which the origin of a scene says that its mesh was refined."""
@@ -102,14 +103,14 @@ def _is_made_by(rule: FibreRule, scene: Scene) -> bool:
     return fibres.shape == scene.fibres.shape and np.allclose(fibres, scene.fibres, atol=1e-9)
 
 
-def wider(scene: Scene | Specimen) -> Scene | Specimen:
+def wider[P: ForwardProblem](scene: P) -> P:
     """Return ``scene`` with every parameter's range wider by half of it on each side."""
     parameters = tuple(parameter.wider() for parameter in scene.parameters)
     origin = {"scene": WIDER, "of": dict(scene.origin)} if scene.origin else {}
-    return replace(scene, parameters=parameters, origin=origin)
+    return cast(P, replace(cast(Any, scene), parameters=parameters, origin=origin))
 
 
-CHANGES: Mapping[str, Callable[[Scene | Specimen], Scene | Specimen]] = {
+CHANGES: Mapping[str, Callable[[ForwardProblem], ForwardProblem]] = {
     FINER: lambda scene: finer(with_mesh(scene)).scene,
     WIDER: wider,
 }

@@ -1,7 +1,7 @@
 """What scenes and specimens have in common: a law, its parameters, and theta in its box.
 
 A :class:`~emulator.scenes.scene.Scene` adds a mesh with loads and supports, a
-:class:`~emulator.scenes.specimen.Specimen` the homogeneous states of a piece of tissue. Forward
+:class:`~emulator.specimens.specimen.Specimen` the homogeneous states of a piece of tissue. Forward
 maps, priors and calibration need no more of either than what is here.
 """
 
@@ -16,6 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from emulator.core.cells import Cells
 from emulator.core.display import TableRepr
 from emulator.core.errors import InputError
 from emulator.geometry.fibres import check_across, checked_directions
@@ -50,6 +51,7 @@ class ForwardProblem(TableRepr):
     angles: tuple[FibreAngles, ...] = ()
     regions: np.ndarray | None = None
     loaded_by: Mapping[str, str] = MappingProxyType({})
+    table: Cells | None = None
 
     @property
     @abstractmethod

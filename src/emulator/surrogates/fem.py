@@ -15,7 +15,6 @@ from emulator.fem.campaign import Row, Solver, solve_rows
 from emulator.fem.simulator import Simulator
 from emulator.fem.solution import EquilibriumSolver
 from emulator.scenes.scene import Scene, all_nodes, check_nodes
-from emulator.surrogates.homogeneous import Homogeneous
 from emulator.surrogates.protocol import ForwardKind, ForwardMap, Prediction, fingerprint_of
 
 
@@ -89,9 +88,9 @@ def fem_forward(simulator: Simulator, start: ForwardMap | None = None) -> FEMFor
 
 def by_solver(solver: EquilibriumSolver, start: ForwardMap | None = None) -> ForwardMap:
     """Return ``solver`` as a forward map over all nodes; that of a specimen is one already."""
-    if isinstance(solver, Homogeneous):
-        return solver
-    return fem_forward(cast(Simulator, solver), start)
+    if isinstance(solver.scene, Scene):
+        return fem_forward(cast(Simulator, solver), start)
+    return cast(ForwardMap, solver)
 
 
 FEM = ForwardKind(

@@ -11,16 +11,24 @@ from pathlib import Path
 from typing import Any
 
 from emulator.core.errors import InputError, look_up
+from emulator.core.rooms import offered
 from emulator.core.store import read_arrays, save_arrays
 from emulator.surrogates.corrected import CORRECTED
 from emulator.surrogates.emulator import EMULATOR
 from emulator.surrogates.fem import FEM
-from emulator.surrogates.homogeneous import HOMOGENEOUS, INCOMPRESSIBLE
 from emulator.surrogates.pod_gp import REDUCED
 from emulator.surrogates.protocol import ForwardKind, ForwardMap, Ingredients, Option
 
 FORWARD_MAPS: dict[str, ForwardKind] = {
-    kind.name: kind for kind in (EMULATOR, CORRECTED, REDUCED, FEM, HOMOGENEOUS, INCOMPRESSIBLE)
+    kind.name: kind
+    for kind in (
+        EMULATOR,
+        CORRECTED,
+        REDUCED,
+        FEM,
+        *offered("emulator.specimens.homogeneous", "HOMOGENEOUS"),
+        *offered("emulator.specimens.homogeneous", "INCOMPRESSIBLE"),
+    )
 }
 
 

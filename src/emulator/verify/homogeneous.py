@@ -5,7 +5,7 @@ and the first Piola stress is diagonal, :math:`P_i = \partial W/\partial\lambda_
 along directions without a prescribed stretch.
 
 The formulas below are written out by hand in NumPy and share no code with the laws they are
-compared with. :func:`verify_homogeneous` solves the specimens (:mod:`emulator.scenes.specimen`) by
+compared with. :func:`verify_homogeneous` solves specimens (:mod:`emulator.specimens.specimen`) by
 finite elements, one tetrahedron a state, those of one law side by side in one scene.
 """
 
@@ -24,8 +24,8 @@ from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
 from emulator.scenes.loads.force import MN_PER_N, Force
-from emulator.scenes.specimen import Specimen, specimen
-from emulator.scenes.states import AXES
+from emulator.specimens.specimen import Specimen, specimen
+from emulator.specimens.states import AXES
 from emulator.verify.benchmark import Benchmark
 
 Values = Mapping[str, float]

@@ -14,8 +14,8 @@ from calibrate.analysis.terms import Terms, _compared, _held_out, find_terms
 from calibrate.cli import main
 from emulator.core.errors import InputError
 from emulator.mechanics.laws.invariant_terms import TERMS
-from emulator.scenes.specimen import specimen
-from emulator.scenes.states import states
+from emulator.specimens.specimen import specimen
+from emulator.specimens.states import states
 
 PULL = np.linspace(1.02, 1.2, 8)
 HALF, STILL = 0.5 + 0.5 * PULL, np.ones(8)

@@ -8,8 +8,8 @@ from calibrate.project.specimen import draft_specimen
 from emulator.core.cells import read_cells
 from emulator.core.errors import InputError
 from emulator.scenes.file import read_scene
-from emulator.scenes.specimen import read_states
-from emulator.scenes.tube import Tube
+from emulator.specimens.specimen import read_states
+from emulator.specimens.tube import Tube
 
 STRETCH = np.linspace(1.0, 1.2, 30)
 STRESS = 10.0 * (STRETCH - STRETCH**-2)

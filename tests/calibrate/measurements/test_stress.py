@@ -5,14 +5,15 @@ import numpy as np
 import pytest
 
 import emulator as em
-from calibrate.measurements import Stress, observations_from_json, parse_observation
+from calibrate.measurements import observations_from_json, parse_observation
 from calibrate.measurements.collection import observations
 from calibrate.measurements.data import read_measurements, write_data
+from calibrate.measurements.stress import Stress
 from emulator.core.errors import InputError
 from emulator.scenes.scene import all_nodes
-from emulator.scenes.specimen import specimen
-from emulator.scenes.states import states
-from emulator.surrogates.homogeneous import Homogeneous
+from emulator.specimens.homogeneous import Homogeneous
+from emulator.specimens.specimen import specimen
+from emulator.specimens.states import states
 from emulator.verify.homogeneous import tetrahedra
 
 S = np.linspace(1.0, 1.4, 5)

@@ -6,11 +6,12 @@ import pytest
 
 import calibrate as cal
 import emulator as em
-from calibrate.measurements import Stretch, observations_from_json, parse_observation
+from calibrate.measurements import observations_from_json, parse_observation
 from calibrate.measurements.collection import observations
 from calibrate.measurements.data import read_measurements, write_data
+from calibrate.measurements.stretch import Stretch
 from emulator.core.errors import InputError
-from emulator.scenes.specimen import read_states, specimen
+from emulator.specimens.specimen import read_states, specimen
 
 S = np.linspace(1.0, 1.4, 5)
 MU = 7.0

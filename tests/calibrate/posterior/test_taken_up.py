@@ -8,7 +8,7 @@ import calibrate as cal
 import emulator as em
 from calibrate.posterior.taken_up import sentences, taken_up
 from emulator.scenes import Parameter
-from emulator.scenes.specimen import specimen
+from emulator.specimens.specimen import specimen
 
 STRETCH = np.linspace(1.0, 1.3, 40)
 

@@ -15,7 +15,7 @@ from calibrate.report import charts
 from calibrate.report.body import body_figure
 from calibrate.report.page import html_of
 from calibrate.samplers.laplace import LaplaceOptions
-from emulator.scenes.states import states
+from emulator.specimens.states import states
 
 pytestmark = pytest.mark.slow  # compiling for a ventricle; test_command.py is quick
 

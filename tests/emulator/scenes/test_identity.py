@@ -10,7 +10,6 @@ from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws import LAWS
 from emulator.mechanics.laws.law import law_identity, probed
 from emulator.scenes import Parameter, Support
-from emulator.scenes.grips import Grips, GripStresses
 from emulator.scenes.identity import _LEFT_OUT, _as_set, described
 from emulator.scenes.loads import (
     LOADS,
@@ -23,11 +22,12 @@ from emulator.scenes.loads import (
     Traction,
 )
 from emulator.scenes.scene_data import SceneData
-from emulator.scenes.specimen import Specimen, specimen
-from emulator.scenes.states import states
 from emulator.scenes.supports import SUPPORTS, ElasticSupport
 from emulator.scenes.tissue import FibreAngles
-from emulator.scenes.tube import Tube
+from emulator.specimens.grips import Grips, GripStresses
+from emulator.specimens.specimen import Specimen, specimen
+from emulator.specimens.states import states
+from emulator.specimens.tube import Tube
 from scene_support import block
 
 

@@ -6,7 +6,7 @@ from scipy.optimize import root
 
 from emulator.mechanics.kinematics import Strain
 from emulator.mechanics.laws import LAWS
-from emulator.surrogates.homogeneous import homogeneous
+from emulator.specimens.homogeneous import homogeneous
 from emulator.verify.homogeneous import SOLUTIONS, pulled, verify_homogeneous
 
 

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from emulator.fem import Solution
     from emulator.fem.unloading import Unloaded
     from emulator.scenes.forward_problem import ForwardProblem
-    from emulator.scenes.specimen import Specimen
 
 
 def _solved(
@@ -58,11 +57,10 @@ def simulate(arguments: Namespace) -> Answer:
     from emulator.fem.fields import element_fields
     from emulator.fem.reactions import supported_sets
     from emulator.geometry.io import write_solution
-    from emulator.scenes.scene import with_mesh
-    from emulator.scenes.specimen import Specimen
+    from emulator.scenes.scene import Scene, with_mesh
 
     problem = words.problem_of(arguments)
-    if isinstance(problem, Specimen) and not arguments.out:
+    if not isinstance(problem, Scene) and not arguments.out:
         return _simulate_states(problem, words.theta_of(arguments, problem))
     scene = with_mesh(problem)
     theta = words.theta_of(arguments, scene)
@@ -112,12 +110,14 @@ def simulate(arguments: Namespace) -> Answer:
     return Answer(result, "\n".join(lines), converged)
 
 
-def _simulate_states(specimen: Specimen, theta: jax.Array) -> Answer:
+def _simulate_states(problem: ForwardProblem, theta: jax.Array) -> Answer:
     """Solve each state of a specimen, and return its volume ratios and stresses."""
     import numpy as np
 
-    from emulator.surrogates.homogeneous import homogeneous, homogeneous_stresses
+    from emulator.specimens.homogeneous import homogeneous, homogeneous_stresses
+    from emulator.specimens.specimen import require_specimen
 
+    specimen = require_specimen(problem)
     states = homogeneous(specimen)
     solution = states.solve(theta)
     J = np.asarray(states.volume_ratio(solution.displacement))

@@ -19,7 +19,7 @@ from emulator.core.errors import InputError
 from emulator.core.store import check_folder, to_json
 
 if TYPE_CHECKING:
-    from emulator.scenes.tube import Tube
+    from emulator.specimens.tube import Tube
 
 
 @command(
@@ -102,7 +102,7 @@ def _init_specimen(table_path: Path, out: str | Path, arguments: Namespace) -> A
 
 def _tube(text: str) -> Tube:
     """Return the sector that ``RADIUS,LAYER,...`` describes."""
-    from emulator.scenes.tube import Tube
+    from emulator.specimens.tube import Tube
 
     try:
         radius, *layers = map(float, text.split(","))

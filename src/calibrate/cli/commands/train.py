@@ -14,7 +14,7 @@ from emulator.core.errors import InputError
 from emulator.core.store import check_folder
 
 if TYPE_CHECKING:
-    from emulator.scenes.specimen import Specimen
+    from emulator.specimens.specimen import Specimen
     from emulator.training.plan import Plan
 
 
@@ -69,15 +69,17 @@ def _add_plan(parser: ArgumentParser) -> None:
 def train(arguments: Namespace) -> Answer:
     """Train and write an emulator."""
     from calibrate.provenance import hardware, versions
-    from emulator.scenes.scene import with_mesh
-    from emulator.scenes.specimen import Specimen
+    from emulator.scenes.scene import Scene, with_mesh
     from emulator.surrogates import load, save_emulator
     from emulator.training import remove_checkpoint
     from emulator.training import train as train_emulator
 
     problem = problem_of(arguments)
-    if isinstance(problem, Specimen) and problem.grips is not None:
-        return _train_grips(problem, arguments)
+    if not isinstance(problem, Scene):
+        from emulator.specimens.specimen import require_specimen
+
+        if (specimen := require_specimen(problem)).grips is not None:
+            return _train_grips(specimen, arguments)
     scene = with_mesh(problem)
     check_folder(arguments.out)
     entries = _plan_entries(arguments)
@@ -126,7 +128,7 @@ def train(arguments: Namespace) -> Answer:
 
 def _train_grips(scene: Specimen, arguments: Namespace) -> Answer:
     """Learn and write what the grips of a specimen add to its stresses."""
-    from emulator.surrogates.gripped import RUNS, learn_grips
+    from emulator.specimens.gripped import RUNS, learn_grips
 
     out = Path(arguments.out)
     if out.suffix != ".safetensors":

@@ -1,6 +1,6 @@
 r"""Specimens as they were held: a box of tissue between the grips of a testing machine.
 
-A homogeneous state (:mod:`emulator.scenes.specimen`) is what the middle of a piece would do far
+A homogeneous state (:mod:`emulator.specimens.specimen`) is what the middle of a piece would do far
 from its grips. The piece itself is a box, whose faces the machine moves by grip displacements q,
 
 .. math:: u_i = q_{ij} L_j \quad\text{on the upper face normal to } j, \qquad
@@ -25,12 +25,12 @@ import numpy as np
 from emulator.core.errors import InputError
 from emulator.geometry.generators.box import box
 from emulator.geometry.mesh import Mesh
-from emulator.scenes.grips import Grips
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene
-from emulator.scenes.specimen import Specimen
-from emulator.scenes.states import AXES, States
 from emulator.scenes.supports.dirichlet import Support
+from emulator.specimens.grips import Grips
+from emulator.specimens.specimen import Specimen
+from emulator.specimens.states import AXES, States
 
 _FACES = (("left", "right"), ("front", "back"), ("bottom", "top"))
 _MIDDLE, _TIE = "middle", "tie"  # sets of the plane of symmetry, and of what stops rigid motions

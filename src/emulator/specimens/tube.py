@@ -37,8 +37,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.errors import InputError
-from emulator.core.units import IN_MM, factor
-from emulator.scenes.states import STRETCHES, States, falls, rows_of, with_unit
+from emulator.core.units import IN_MM, factor, with_unit
+from emulator.specimens.states import STRETCHES, States, falls, rows_of
 
 _RADIUS = re.compile(r"(inner|outer)_(radius|diameter)")
 _AXIAL = "stretch_axial"
@@ -122,7 +122,7 @@ class Tube:
         Parameters
         ----------
         columns : a radius or a diameter, and ``stretch_axial``, each (m,).
-        protocols : as of :func:`~emulator.scenes.states.states`.
+        protocols : as of :func:`~emulator.specimens.states.states`.
         ordered : whether no test may go back.
 
         Raises

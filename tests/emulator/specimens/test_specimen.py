@@ -8,11 +8,12 @@ import calibrate as cal
 import emulator as em
 from emulator.catalogue import find_problem
 from emulator.core.errors import InputError
+from emulator.core.units import with_unit
 from emulator.scenes.file import read_scene
-from emulator.scenes.grips import Grips
 from emulator.scenes.scene import with_mesh
-from emulator.scenes.specimen import read_states, require_specimen, specimen
-from emulator.scenes.states import states, with_unit
+from emulator.specimens.grips import Grips
+from emulator.specimens.specimen import read_states, require_specimen, specimen
+from emulator.specimens.states import states
 
 NAN = np.nan
 

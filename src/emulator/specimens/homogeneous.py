@@ -36,7 +36,7 @@ from emulator.fem.material_point import stress_and_moduli
 from emulator.fem.solution import Solution, Status
 from emulator.mechanics.kinematics import cofactor, determinant
 from emulator.scenes.scene import all_nodes, check_nodes
-from emulator.scenes.specimen import Specimen, require_specimen
+from emulator.specimens.specimen import Specimen, require_specimen
 from emulator.surrogates.protocol import ForwardKind, Prediction, fingerprint_of
 
 _ITERATIONS = 300  # an exponent falls by about 1 in each, far away

@@ -1,7 +1,7 @@
 r"""Specimens: pieces of tissue in a testing machine, in homogeneous states.
 
 Uniaxial, biaxial and shear tests deform the middle of a piece evenly, and so does each point of an
-inflated tube's wall. A specimen is a law and the states (:mod:`emulator.scenes.states`) whose
+inflated tube's wall. A specimen is a law and the states (:mod:`emulator.specimens.states`) whose
 stresses follow from it. It has no mesh: where a forward map gives displacements, those of a
 specimen are the columns of the gradient H of each state, :math:`u = H e_k`, the displacements of
 the corners :math:`e_x, e_y, e_z` (mm) of a unit cube.
@@ -23,19 +23,20 @@ import numpy as np
 
 from emulator.core.cells import PROTOCOL, Cells, read_cells
 from emulator.core.errors import InputError
+from emulator.core.units import with_unit
 from emulator.geometry.mesh import Mesh, frozen_array
 from emulator.mechanics.laws import Law
 from emulator.mechanics.laws.law import law_identity
 from emulator.scenes.fibre_rules import FibreRule
 from emulator.scenes.forward_problem import ForwardProblem
-from emulator.scenes.grips import Grips
 from emulator.scenes.identity import Identity, described_fields, fingerprint
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import with_mesh
-from emulator.scenes.states import States, motion_columns, pull_columns, states, with_unit
 from emulator.scenes.tissue import FibreAngles, Tissue, stiffness_of, turned
-from emulator.scenes.tube import Tube
-from emulator.scenes.tube import motion_columns as tube_columns
+from emulator.specimens.grips import Grips
+from emulator.specimens.states import States, motion_columns, pull_columns, states
+from emulator.specimens.tube import Tube
+from emulator.specimens.tube import motion_columns as tube_columns
 
 _CONVENTION = re.compile(r"(lambda|λ|sigma|σ)_?([xyzXYZ]{1,2})")
 
@@ -55,9 +56,9 @@ class Specimen(ForwardProblem):
     origin : the file that the specimen was read from, as a scene's.
     fibre_rule : the rule by which the directions were made.
     angles : parameters that turn fibres and sheets, as a scene's.
-    tube : the sector whose wall's points the states are (:mod:`emulator.scenes.tube`). With several
-        layers, region k is layer k from the inside.
-    grips : how the piece was held (:mod:`emulator.scenes.gripped`).
+    tube : the sector whose wall's points the states are (:mod:`emulator.specimens.tube`). With
+        several layers, region k is layer k from the inside.
+    grips : how the piece was held (:mod:`emulator.specimens.piece`).
     table : the table that the states were read from.
     homogeneous : whether somebody said that a piece without ``grips`` deforms evenly. It changes no
         solution: verdicts name the assumption, and by whom it is made.
@@ -159,9 +160,10 @@ def specimen(
 
     Parameters
     ----------
-    given : its states, or the columns (m,) of :func:`~emulator.scenes.states.states`, of one test.
+    given : its states, or the columns (m,) of one test, as
+        :func:`~emulator.specimens.states.states` takes them.
     ordered : see there.
-    tube : the sector of a tube whose motion ``given`` is, see :mod:`emulator.scenes.tube`.
+    tube : the sector of a tube whose motion ``given`` is, see :mod:`emulator.specimens.tube`.
     entries : the other fields of a :class:`Specimen`.
     """
     if not isinstance(given, States):

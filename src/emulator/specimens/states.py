@@ -31,12 +31,11 @@ import numpy as np
 
 from emulator.core.cells import PROTOCOL
 from emulator.core.errors import InputError
-from emulator.core.units import IN_KPA, factor
+from emulator.core.units import IN_KPA, factor, with_unit
 
 AXES = "xyz"
 APPLIED = "applied"
 _MOTION = re.compile(rf"(stretch|strain|green|{APPLIED})_([xyz])|shear_([xyz])([xyz])")
-_WITH_UNIT = re.compile(r"([^\[(]*[^\[( ]) *(?:[\[(] *([^\])]*?) *[\])])?")
 STRETCHES = (0.1, 12.0)
 """Smallest and largest stretch that a table may have; elastomers reach 10."""
 _MOST_SHEAR = 5.0
@@ -76,12 +75,6 @@ class States(NamedTuple):
             steps += np.linalg.norm(np.diff(self.pulls[rows], axis=0), axis=1) / largest
             found[rows[1:]] = np.cumsum(steps)
         return found
-
-
-def with_unit(word: str) -> tuple[str, str]:
-    """Return the name and the unit of a column such as ``stress_x [kPa]``; no unit is empty."""
-    found = _WITH_UNIT.fullmatch(word.strip())
-    return (found[1], found[2] or "") if found else (word, "")
 
 
 def motion_columns(words: Collection[str]) -> list[str]:

@@ -9,9 +9,9 @@ import emulator as em
 from emulator.core.errors import InputError
 from emulator.fem.energy import point_energy
 from emulator.scenes.scene import all_nodes
-from emulator.scenes.specimen import specimen
-from emulator.scenes.states import states
-from emulator.surrogates.homogeneous import Homogeneous, homogeneous_stresses
+from emulator.specimens.homogeneous import Homogeneous, homogeneous_stresses
+from emulator.specimens.specimen import specimen
+from emulator.specimens.states import states
 from emulator.verify.homogeneous import tetrahedra
 
 NAN = np.nan

@@ -32,11 +32,11 @@ from emulator.core.errors import InputError, SolverError
 from emulator.fem.campaign import at_once, in_order
 from emulator.fem.campaign.designs import sobol
 from emulator.fem.simulator import Simulator
-from emulator.scenes.gripped import Piece, pieces
-from emulator.scenes.grips import GripStresses
-from emulator.scenes.specimen import Specimen
-from emulator.scenes.states import States
-from emulator.surrogates.homogeneous import Homogeneous, homogeneous, homogeneous_stresses
+from emulator.specimens.grips import GripStresses
+from emulator.specimens.homogeneous import Homogeneous, homogeneous, homogeneous_stresses
+from emulator.specimens.piece import Piece, pieces
+from emulator.specimens.specimen import Specimen
+from emulator.specimens.states import States
 from emulator.surrogates.polynomial import Samples, fit, legendre, terms
 from emulator.surrogates.protocol import fingerprint_of
 
@@ -93,7 +93,7 @@ class GrippedSpecimen:
     specimen : the specimen, with grips.
 
     :class:`InputError` for a specimen without grips, or as of
-    :func:`~emulator.scenes.gripped.pieces`.
+    :func:`~emulator.specimens.piece.pieces`.
     """
 
     specimen: Specimen

@@ -11,11 +11,11 @@ import calibrate as cal
 import emulator as em
 from emulator.core.errors import InputError
 from emulator.fem.energy import strain_energy
-from emulator.scenes.gripped import pieces
-from emulator.scenes.grips import Grips, GripStresses
-from emulator.scenes.specimen import specimen
-from emulator.scenes.states import states
-from emulator.surrogates.gripped import GrippedSpecimen, learn_grips
+from emulator.specimens.gripped import GrippedSpecimen, learn_grips
+from emulator.specimens.grips import Grips, GripStresses
+from emulator.specimens.piece import pieces
+from emulator.specimens.specimen import specimen
+from emulator.specimens.states import states
 
 PULL = np.array([1.0, 1.05, 1.1, 1.2])
 ISOTROPIC = {
