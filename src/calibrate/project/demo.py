@@ -64,8 +64,7 @@ def run_demo(
     if is_beam:
         for draw in draws:
             body = posterior.model.forward.scene
-            simulator = simulator_of(body, run.load_steps)
-            truth = simulator.solve(body.theta(**run.truth)).require_converged().displacement
+            truth = simulator_of(body, run.load_steps)(body.theta(**run.truth))
             draw(posterior, certificate, truth, run.truth, folder / PICTURE)
     else:
         for identify in offered("calibrate.analysis.identifiability", "identify"):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -17,8 +17,11 @@ from jax.flatten_util import ravel_pytree
 
 from calibrate.statistical_model.model import Data, Model
 from emulator.core.errors import InputError, SolverError
+from emulator.fem import Simulator
 from emulator.fem.campaign import Solver, solve_rows
+from emulator.fem.energy import volume_ratio
 from emulator.fem.solution import EquilibriumSolver
+from emulator.scenes.scene import Scene
 
 
 class Likelihoods(NamedTuple):
@@ -131,7 +134,14 @@ class FEMLikelihood:
 
     def _stable(self, fields: list[jax.Array], thetas: jax.Array) -> bool | None:
         """Return whether every state's equilibrium is a minimum of the energy, if there is one."""
-        if not self.simulator.has_energy:
+        scene = self.simulator.scene
+        if not isinstance(scene, Scene):
+            has_energy = True
+        elif scene.loaded_by:  # without a system of its own: one at rest for each theta
+            has_energy = all(load.has_potential for load in scene.loads)
+        else:
+            has_energy = not cast(Simulator, self.simulator).system.forces
+        if not has_energy:
             return None
         return all(
             self.simulator.is_stable(u, theta) for u, theta in zip(fields, thetas, strict=True)
@@ -162,5 +172,5 @@ class FEMLikelihood:
         """Return the log likelihood, the means and the smallest volume ratio."""
         means = self.model.observe(fields[:, self.model.observe.nodes], thetas)
         value = self.model.fem_log_likelihood(draw, means, data)
-        ratios = [self.simulator.volume_ratio(u) for u in fields]
+        ratios = [volume_ratio(self.simulator.scene, u) for u in fields]
         return value, means, jnp.min(jnp.stack(ratios))

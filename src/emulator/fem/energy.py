@@ -58,14 +58,14 @@ def require_shape(scene: Scene, name: str, array: jax.Array, shape: tuple[int, .
 
 def displacement_gradient(scene: Scene, u: jax.Array) -> jax.Array:
     """Return ``H = du/dX`` at every quadrature point, (m, q, 3, 3), from ``u`` (n, 3) in mm."""
-    local = u[scene.discretisation.connectivity]
-    return jnp.einsum("mai,mqaj->mqij", local, scene.discretisation.gradients)
+    return scene.gradients(u)
 
 
-def volume_ratio(scene: Scene, u: jax.Array) -> jax.Array:
-    """Return ``J = det F`` at every quadrature point, (m, q); J <= 0 is an inverted element."""
-    H = displacement_gradient(scene, u)
-    return at_points(determinant, H + jnp.eye(3, dtype=H.dtype))
+def volume_ratio(scene: ForwardProblem, u: jax.Array) -> jax.Array:
+    """Return ``J = det F`` at every point, (m, q), or state, (m,); J <= 0 is an inverted one."""
+    H = scene.gradients(u)
+    F = (H + jnp.eye(3, dtype=H.dtype)).reshape(-1, 3, 3)
+    return jax.vmap(determinant)(F).reshape(H.shape[:-2])
 
 
 def parameters_at(scene: ForwardProblem, theta: jax.Array) -> Callable[[Tissue], list[jax.Array]]:

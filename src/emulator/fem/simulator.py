@@ -34,7 +34,7 @@ from emulator.fem.derivatives import (
     require_finite,
     sensitivities,
 )
-from emulator.fem.energy import require_shape, volume_ratio
+from emulator.fem.energy import require_shape
 from emulator.fem.linear.suitesparse import prepare
 from emulator.fem.loaded import LoadedEquilibrium
 from emulator.fem.newton import NewtonOptions
@@ -198,17 +198,6 @@ class Simulator(TableRepr):
             return value, by_theta + jnp.tensordot(self.sensitivities(u, theta), by_u, 2)
 
         return value_and_gradient
-
-    @property
-    def has_energy(self) -> bool:
-        """Whether an equilibrium is a minimum or a saddle of some energy."""
-        if self.scene.loaded_by:  # without a system of its own: one at rest for each theta
-            return all(load.has_potential for load in self.scene.loads)
-        return not self.system.forces
-
-    def volume_ratio(self, u: jax.Array) -> jax.Array:
-        """Return J = det F at every quadrature point, (m, q), at the displacement ``u`` (n, 3)."""
-        return volume_ratio(self.scene, u)
 
     def is_stable(self, u: jax.Array, theta: jax.Array) -> bool:
         """Return whether the equilibrium ``u`` (n, 3) mm at ``theta`` is a minimum of the energy.

@@ -89,14 +89,14 @@ class EquilibriumSolver(Protocol):
     """What solves a scene or a specimen: a simulator, or the map of a specimen's states.
 
     scene : the scene or the specimen that is solved.
-    has_energy : whether an equilibrium is a minimum or a saddle of some energy.
     """
 
     @property
     def scene(self) -> ForwardProblem: ...  # noqa: D102
 
-    @property
-    def has_energy(self) -> bool: ...  # noqa: D102
+    def __call__(self, theta: jax.Array) -> jax.Array:
+        """Return the displacement (n, 3) in mm; :class:`SolverError` when it does not converge."""
+        ...
 
     def solve(self, theta: jax.Array, start: jax.Array | None = None) -> Solution:
         """Return the equilibrium at ``theta`` (p,), sought from ``start`` (n, 3) mm if given."""
@@ -108,10 +108,6 @@ class EquilibriumSolver(Protocol):
 
     def is_stable(self, u: jax.Array, theta: jax.Array) -> bool:
         """Return whether the equilibrium ``u`` (n, 3) mm is a minimum of the energy."""
-        ...
-
-    def volume_ratio(self, u: jax.Array) -> jax.Array:
-        """Return J = det F at every point of the body, of whatever shape."""
         ...
 
 

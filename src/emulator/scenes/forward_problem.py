@@ -64,6 +64,10 @@ class ForwardProblem(TableRepr):
         """Short hash of all that solutions depend on, and of the order and the box of theta."""
 
     @abstractmethod
+    def gradients(self, u: jax.Array) -> jax.Array:
+        """Return ``H = du/dX`` at every point or state, (..., 3, 3), from ``u`` (n, 3) in mm."""
+
+    @abstractmethod
     def tissue_at(self, theta: jax.Array) -> Tissue:
         """Return material data at ``theta`` (p,), stacked over elements and points, or states."""
 

@@ -56,6 +56,11 @@ class Scene(SceneData):
         """The elements, or patches of them, that the strain energy is a sum over."""
         return patchwise(self.discretisation) if self.dilatation == "patch" else self.discretisation
 
+    def gradients(self, u: jax.Array) -> jax.Array:
+        """Return ``H = du/dX`` at every quadrature point, (m, q, 3, 3), from ``u`` (n, 3) in mm."""
+        local = u[self.discretisation.connectivity]
+        return jnp.einsum("mai,mqaj->mqij", local, self.discretisation.gradients)
+
     # Tissue: directions and regions at the quadrature points.
 
     @property

@@ -30,7 +30,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.core.errors import InputError
+from emulator.core.errors import InputError, SolverError
 from emulator.fem.energy import point_energy
 from emulator.fem.material_point import stress_and_moduli
 from emulator.fem.solution import Solution, Status
@@ -90,8 +90,14 @@ class Homogeneous:
         return fingerprint_of(self.kind, self.scene.fingerprint, self.nodes)
 
     def __call__(self, theta: jax.Array) -> jax.Array:
-        """Return the displacement (k, 3) mm at ``theta`` (p,)."""
-        return self.evaluate(theta).displacement
+        """Return the displacement (k, 3) mm at ``theta`` (p,).
+
+        :class:`SolverError` where a state has no equilibrium; inside ``jit`` nothing can be raised.
+        """
+        u, valid = self.evaluate(theta)
+        if not isinstance(valid, jax.core.Tracer) and not valid:
+            raise SolverError(f"scene '{self.scene.name}': a state has no equilibrium")
+        return u
 
     def evaluate(self, theta: jax.Array) -> Prediction:
         """Return the displacement (k, 3) mm, and whether all states are in equilibrium."""
@@ -156,11 +162,6 @@ class Homogeneous:
         slopes = jax.jacfwd(lambda theta: self._evaluate(theta).displacement)
         return jax.jit(lambda theta: jnp.moveaxis(slopes(theta), -1, 0))
 
-    @property
-    def has_energy(self) -> bool:
-        """Whether an equilibrium is a minimum or a saddle of some energy: it always is."""
-        return True
-
     def is_stable(self, u: jax.Array, theta: jax.Array) -> bool:
         """Return whether each state at ``u`` (n, 3) mm is a minimum in its free stretches."""
         moduli = self._moduli(self.scene.gradients(u), theta)
@@ -176,10 +177,6 @@ class Homogeneous:
             return jax.vmap(of_point)(H, self.scene.tissue_at(theta))[1]
 
         return jax.jit(moduli)
-
-    def volume_ratio(self, u: jax.Array) -> jax.Array:
-        """Return J = det F of the states (m,) at ``u`` (n, 3) mm."""
-        return jax.vmap(determinant)(self.scene.gradients(u) + jnp.eye(3))
 
 
 def homogeneous_stresses(

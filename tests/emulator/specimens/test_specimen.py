@@ -237,3 +237,33 @@ def test_sheets_are_tests(tmp_path):
     }
     np.testing.assert_array_equal(given.free[0], [False, True, True])
     np.testing.assert_array_equal(given.free[5], [True, False, True])
+
+
+FIBRES = """
+[fibres]
+rule = "uniform"
+direction = [2.0, 0.0, 0.0]
+angle = "alpha"
+about = [0.0, 0.0, 1.0]
+[parameters.alpha]
+unit = "deg"
+range = [0.0, 90.0]
+"""
+
+
+def test_a_parameter_turns_the_fibres_of_every_state(tmp_path):
+    (tmp_path / "table.csv").write_text("stretch_x,stress_x\n1.0,0\n1.1,1\n")
+    law = SCENE.replace("neo_hookean", "holzapfel_ogden").replace("mu", "a")
+    constants = "kappa = 10.0\nb = 1.0\na_f = 1.0\nb_f = 1.0\n"
+    text = law.replace("lam = 10.0\n", constants) + FIBRES
+    (tmp_path / "scene.toml").write_text(text)
+    piece = read_scene(tmp_path / "scene.toml")
+    turned = piece.tissue_at(piece.theta(a=5.0, alpha=30.0)).directions
+    np.testing.assert_allclose(turned, np.tile([np.sqrt(0.75), 0.5, 0.0], (2, 1)), atol=1e-12)
+    (tmp_path / "scene.toml").write_text(text.replace('"uniform"', '"biventricle"'))
+    with pytest.raises(InputError):
+        read_scene(tmp_path / "scene.toml")
+    helix = '[fibres]\nrule = "helix"\nangles = [60.0, -60.0]\n'
+    (tmp_path / "scene.toml").write_text(law.replace("lam = 10.0\n", constants) + helix)
+    with pytest.raises(InputError, match="rule 'helix' is for a mesh; a specimen has 'uniform'"):
+        read_scene(tmp_path / "scene.toml")
