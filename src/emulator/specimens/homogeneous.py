@@ -113,15 +113,12 @@ class Homogeneous:
         H, _, pulls, _ = self.scene.states
         point = Point(point_energy(self.scene, theta), stress_and_moduli(self.scene, theta))
         tissue = jax.tree.map(lambda values: values[rows], self.scene.tissue_at(theta))
-        settled, converged = jax.vmap(partial(equilibrium, point, self._guesses))(
+        guesses = _GUESSES if pulls.any() else _GUESSES[:0]
+        settled, converged = jax.vmap(partial(equilibrium, point, guesses))(
             jnp.asarray(H[rows]), jnp.asarray(pulls[rows]), *self._free(rows), tissue
         )
         columns = jnp.swapaxes(settled, 1, 2)[of_node, self.nodes % 3]
         return Prediction(columns, jnp.all(converged))
-
-    @property
-    def _guesses(self) -> np.ndarray:
-        return _GUESSES if self.scene.states.pulls.any() else _GUESSES[:0]
 
     def _free(self, rows: np.ndarray) -> tuple[jax.Array, jax.Array]:
         """Return the axes (e, u) of the free stretches, 3 for none, and that of the last, (e,).
