@@ -182,12 +182,12 @@ class _PageHandler(Handler):
             self.send(404, b"there are /, /at, /curve, /error and /compare\n", "text/plain")
         else:
             try:
-                found = getattr(explorer, name)(dict(parse_qsl(address.query)))
+                content = getattr(explorer, name)(dict(parse_qsl(address.query)))
             except InputError as fault:
                 self.send(400, f"{fault}\n".encode(), "text/plain; charset=utf-8")
                 return
-            plain = isinstance(found, bytes)
-            self.send(200, found, "application/octet-stream" if plain else "application/json")
+            plain = isinstance(content, bytes)
+            self.send(200, content, "application/octet-stream" if plain else "application/json")
 
 
 def serve(explorer: Explorer, port: int = 0) -> Server:

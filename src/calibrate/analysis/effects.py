@@ -127,12 +127,12 @@ def recommend(
     alone = [compared.without((name,)) for name in effects]
     chosen: tuple[str, ...] = ()
     best = compared.without(())
-    for each in sorted(alone, key=lambda m: m.ratio):
-        if not each.within(limits) or each.ratio > _SAVES:
+    for effect in sorted(alone, key=lambda m: m.ratio):
+        if not effect.within(limits) or effect.ratio > _SAVES:
             continue
-        trial = compared.without((*chosen, *each.left_out))
+        trial = compared.without((*chosen, *effect.left_out))
         if trial.within(limits) and trial.ratio < _SAVES * best.ratio:
-            chosen, best = (*chosen, *each.left_out), trial
+            chosen, best = (*chosen, *effect.left_out), trial
     whole = judged = compared.without(())
     trials = 0
     while chosen:
@@ -222,10 +222,10 @@ class WithoutTerms:
         onto = Onto(self._scene, simpler)
         first, _ = _clocked(simulator, simpler.centre)
         values, times, ratios, status = [], [], [], Status.CONVERGED
-        for own, theta in zip(onto.theta(self._thetas), self._thetas, strict=True):
+        for simpler_theta, theta in zip(onto.theta(self._thetas), self._thetas, strict=True):
             # Solvers keep factors of values they have seen: not the theta of the comparison again.
             whole_seconds = _clocked(whole, theta * (1.0 + _ASIDE))[0] if names else None
-            seconds, solution = _clocked(simulator, own)
+            seconds, solution = _clocked(simulator, simpler_theta)
             times.append(seconds)
             ratios.append(1.0 if whole_seconds is None else seconds / whole_seconds)
             status = Status(int(solution.status))

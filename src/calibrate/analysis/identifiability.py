@@ -82,7 +82,7 @@ def identify(posterior: Posterior) -> dict[str, Any]:
     x, prior = (np.asarray(model.on_scales(theta)) for theta in (after, prior_table(model)))
     contraction = 1.0 - x.std(axis=0, ddof=1) / prior.std(axis=0, ddof=1)
     correlation = np.atleast_2d(np.corrcoef(x, rowvar=False))
-    posterior_S, prior_S = (np.atleast_2d(np.cov(each, rowvar=False)) for each in (x, prior))
+    posterior_S, prior_S = (np.atleast_2d(np.cov(points, rowvar=False)) for points in (x, prior))
     ends = posterior.box_ends()
     cut = {end.name for end in ends}
     known = combinations(model, posterior_S, prior_S, after.mean(axis=0))

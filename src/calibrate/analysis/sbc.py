@@ -100,8 +100,8 @@ class Calibration:
         All q functions of a right posterior stay inside together with ``probability`` at least:
         each has a band of :math:`1 - (1 - \text{probability}) / q` (Bonferroni).
         """
-        each = 1.0 - (1.0 - probability) / len(self.ranks)
-        return {name: self.band(name, each).outside for name in self.ranks}
+        band_probability = 1.0 - (1.0 - probability) / len(self.ranks)
+        return {name: self.band(name, band_probability).outside for name in self.ranks}
 
     @property
     def passed(self) -> bool:
@@ -230,10 +230,10 @@ def sbc(
         return {name: values[rows] for name, values in every.items()}
 
     data_sets = predictions.prior_replicates(truth, jax.random.key(seed), replicates)
-    if (found := len(data_sets.draws[truth.names[0]])) < _FEWEST:
-        raise InputError(f"calibration: {predictions.shortfall(found, replicates)[0]}")
-    each = _replicates(model, data_sets, draw or sampled, seed, progress=progress)
-    return calibration_of(each, seed)
+    if (count := len(data_sets.draws[truth.names[0]])) < _FEWEST:
+        raise InputError(f"calibration: {predictions.shortfall(count, replicates)[0]}")
+    ranks = _replicates(model, data_sets, draw or sampled, seed, progress=progress)
+    return calibration_of(ranks, seed)
 
 
 def _replicates(

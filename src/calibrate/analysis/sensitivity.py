@@ -262,7 +262,7 @@ def _by_screening(
         )  # fmt: skip
         for name, key in names.items():
             effects[name][:, k] = np.ma.filled(np.ma.asarray(result[key], dtype=float), np.nan)
-    data: dict[str, Any] = {name: (("factor", "output"), each) for name, each in effects.items()}
+    data: dict[str, Any] = {name: (("factor", "output"), x) for name, x in effects.items()}
     return data | {
         "mu_star_together": ("factor", np.sqrt(np.mean(effects["mu_star"] ** 2, axis=1)))
     }

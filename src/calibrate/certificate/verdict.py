@@ -76,7 +76,7 @@ class Certificate(TableRepr):
 
     def summary_rows(self) -> tuple[str, list[tuple[str, str]]]:
         """Return title and rows of the table: verdict, findings, and the number of FEM runs."""
-        rows = [("verdict", str(self.verdict)), *(("finding", each) for each in self.findings)]
+        rows = [("verdict", str(self.verdict)), *(("finding", text) for text in self.findings)]
         return "Certificate", [*rows, ("FEM runs", str(self.evidence.physics.runs))]
 
     @property
@@ -219,7 +219,7 @@ def _agreement(evidence: Evidence) -> tuple[Verdict, list[Finding]]:
     if agree:
         worst = max((abs(f.value) for f in draws.shift.values()), default=0.0)
         return "accepted", [(f"no mean moves by more than {worst:.2f} posterior sd", "")]
-    decisive = [each for each in comparisons if each[1].within(each[2]) is agree]
+    decisive = [row for row in comparisons if row[1].within(row[2]) is agree]
     if agree is None:
         factor = max(figure.factor_to_decide(limit) for _, figure, limit in decisive)
         runs = evidence.physics.runs * factor

@@ -25,9 +25,9 @@ def draw_calibration(calibration: Calibration, title: str, path: str | Path) -> 
     """
     names, outside = list(calibration.ranks), calibration.outside()
     figure, grid = panels(len(names), 3, (3.6, 2.9), sharex=True)
-    each = 1.0 - 0.05 / len(names)
+    probability = 1.0 - 0.05 / len(names)
     for axes, name in zip(grid.flat, names, strict=False):
-        band = calibration.band(name, each)
+        band = calibration.band(name, probability)
         axes.fill_between(band.x, band.low - band.x, band.high - band.x, color=_BAND, lw=0)
         color = _OUTSIDE if outside[name] else _INSIDE
         axes.step(band.x, band.ecdf - band.x, where="post", color=color, lw=1.4)

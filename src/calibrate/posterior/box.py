@@ -94,18 +94,18 @@ def box_ends(draws: Mapping[str, np.ndarray], box: Mapping[str, Parameter]) -> l
         sd = float(np.sqrt(d @ covariance @ d))
         if not 0.0 < sd < _OPEN * np.sqrt((d**2).sum() / 12.0):
             continue
-        up, down = (_exit(x, each, wider, _FAR * sd) for each in (d, -d))
+        up, down = (_exit(x, direction, wider, _FAR * sd) for direction in (d, -d))
         shift = (up.mass * up.beyond - down.mass * down.beyond) / (1.0 + up.mass + down.mass)
         if abs(shift) <= LARGEST_SHIFT * sd:
             continue
         for end in (up if shift > 0.0 else down).ends:
             worst[end] = max(worst.get(end, 0.0), min(abs(shift) / sd, _FAR))
-    found = []
+    ends = []
     for (k, at_high), shift in sorted(worst.items(), key=lambda item: -item[1]):
         parameter = box[names[k]]
         value = parameter.high if at_high else parameter.low
-        found.append(BoxEnd(names[k], value, parameter.unit, shift))
-    return found
+        ends.append(BoxEnd(names[k], value, parameter.unit, shift))
+    return ends
 
 
 @dataclass(frozen=True)

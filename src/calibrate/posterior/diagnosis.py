@@ -114,8 +114,8 @@ def map_fault(errors: Mapping[str, float], moves: float = np.nan) -> Fault | Non
         f"{value:.2g} {unit}" if np.isfinite(value) else "an unknown amount"
         for value, unit in ((sizes[worst], "noise sd"), (moves, "sd"))
     )
-    told = f", and FEM in its place would move a mean by {most}"
-    most = told if moves > LARGEST_MAP_MOVE else ""
+    consequence = f", and FEM in its place would move a mean by {most}"
+    most = consequence if moves > LARGEST_MAP_MOVE else ""
     return (
         f"the forward map misses FEM by {size} in {worst} at the draws{most}",
         "infer with --forward corrected (or more of its --steps), or let the map's error widen the "
@@ -130,7 +130,7 @@ class Summary(dict[str, dict[str, float]]):
         """Return a line for each parameter, numbers to four digits."""
         columns = list(next(iter(self.values()), {}))
         rows = [["", *columns]]
-        rows += [[name, *(f"{row[each]:.4g}" for each in columns)] for name, row in self.items()]
+        rows += [[name, *(f"{row[c]:.4g}" for c in columns)] for name, row in self.items()]
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         lines = []
         for row in rows:
@@ -262,9 +262,9 @@ def nothing_learned(tree: xr.DataTree, unknowns: Sequence[str], noise: str) -> l
         np.stack([np.ravel(tree[group][name]) for name in unknowns])
         for group in ("prior", "posterior")
     )
-    moved = max(ks_2samp(*rows).statistic for rows in zip(before, after, strict=True))
+    statistic = max(ks_2samp(*rows).statistic for rows in zip(before, after, strict=True))
     least = np.sqrt(eigvalsh(np.atleast_2d(np.cov(after)), np.atleast_2d(np.cov(before)))[0])
-    if not (least >= _LITTLE_SD and moved <= _LITTLE_MOVED):
+    if not (least >= _LITTLE_SD and statistic <= _LITTLE_MOVED):
         return []
     return [
         f"the data say next to nothing: what is known best keeps {100 * min(least, 1.0):.0f} % of "

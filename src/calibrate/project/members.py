@@ -132,13 +132,16 @@ def infer_members(
         posteriors: dict[str, Posterior] = {}
         verdicts: dict[str, str] = {}
         for name, run in plan.members.items():
-            own = folder / MEMBERS / name
-            posteriors[name] = _posterior_of(plan.problem(name), own, force, progress)
+            member_folder = folder / MEMBERS / name
+            posteriors[name] = _posterior_of(plan.problem(name), member_folder, force, progress)
             if certify:
                 verdicts[name] = (
-                    _written_verdict(own)
+                    _written_verdict(member_folder)
                     or certify_and_keep(
-                        posteriors[name], own, load_steps=run.load_steps, progress=progress
+                        posteriors[name],
+                        member_folder,
+                        load_steps=run.load_steps,
+                        progress=progress,
                     ).verdict
                 )
         hierarchy = _sample_together(plan, posteriors, folder / SAMPLING, progress=progress)

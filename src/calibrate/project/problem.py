@@ -205,7 +205,7 @@ def model_before_data(run: Run | Problem, *, progress: bool = False) -> Model:
         return run_model
     # Some of these errors depend on the deformed body, which is taken at a draw of the prior.
     draws = run_model.prior_draws(jax.random.key(run.seed), 1)
-    predicted, _ = run_model.predict({name: each[0] for name, each in draws.items()})
+    predicted, _ = run_model.predict({name: values[0] for name, values in draws.items()})
     means = {name: np.asarray(mean) for name, mean in predicted.items()}
     return with_described_errors(run_model, means, run.systematic)[0]
 

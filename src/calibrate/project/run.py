@@ -174,8 +174,8 @@ class Run:
     def synthetic_noise(self, observe: Observations) -> dict[str, Noise]:
         """Return the noise of each observation of synthetic data."""
         noises = replace(self, noise_scale={}).noises(observe)
-        each = {name: noise for name, (_, noise) in observe.expand(noises, "noise").items()}
-        return at_sites(each, observe)
+        by_name = {name: noise for name, (_, noise) in observe.expand(noises, "noise").items()}
+        return at_sites(by_name, observe)
 
 
 def _by_name[T](

@@ -62,7 +62,7 @@ class ArrayPart:
 
     def arrays(self) -> dict[str, Any]:
         """Return all arrays by name."""
-        values = ((each.name, getattr(self, each.name)) for each in fields(self))  # type: ignore[arg-type]
+        values = ((field.name, getattr(self, field.name)) for field in fields(self))  # type: ignore[arg-type]
         return named_leaves({n: v._asdict() if hasattr(v, "_asdict") else v for n, v in values})
 
     def to_json(self) -> dict[str, Any]:

@@ -146,8 +146,8 @@ def unload(arguments: Namespace) -> Answer:
     result |= {
         "largest_displacement": float(np.linalg.norm(unloaded.displacement, axis=1).max()),
         "volumes": {
-            name: {"loaded_ml": each["rest_ml"], "unloaded_ml": each["volume_ml"]}
-            for name, each in volumes(scene, unloaded.displacement).items()
+            name: {"loaded_ml": volume["rest_ml"], "unloaded_ml": volume["volume_ml"]}
+            for name, volume in volumes(scene, unloaded.displacement).items()
         },
         "reloaded": {
             "status": status.name.lower(),
@@ -157,8 +157,8 @@ def unload(arguments: Namespace) -> Answer:
     }
     lines = [line, f"largest displacement {result['largest_displacement']:.6g} mm"]
     lines += [
-        f"cavity '{name}': {each['unloaded_ml']:.6g} mL, under load {each['loaded_ml']:.6g} mL"
-        for name, each in result["volumes"].items()
+        f"cavity '{name}': {volume['unloaded_ml']:.6g} mL, under load {volume['loaded_ml']:.6g} mL"
+        for name, volume in result["volumes"].items()
     ]
     lines.append(
         f"loaded again from rest: {status.text}, residual {reloaded.residual:.1e}, "
