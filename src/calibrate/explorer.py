@@ -171,7 +171,7 @@ class _PageHandler(Handler):
     """Answers one request to the explorer, the server's subject."""
 
     def do_GET(self) -> None:
-        """Answer with the page, or with what the page asks for."""
+        """Answer with the page, or with the data that the page asks for."""
         address, explorer = urlsplit(self.path), self.server.subject
         name = address.path.removeprefix("/")
         if self.is_foreign():

@@ -1,4 +1,4 @@
-"""Which effects a scene can do without: what each changes in what is observed, and what it costs.
+"""Effects that a scene can do without: the change of the observations, and the time, of each.
 
 Everything is measured by FEM, the whole scene's runs against the simpler scene's at the same theta.
 Effects that alone change every observation by no more than its tolerance, and whose absence saves
@@ -209,7 +209,7 @@ class WithoutTerms:
         return self.of(names, lambda: leave_out(self._scene, names))
 
     def of(self, names: tuple[str, ...], make: Callable[[], Scene]) -> Measured:
-        """Return the comparison with another scene, whose parameters the whole one has, too."""
+        """Return the comparison with a scene whose parameters the whole scene has, too."""
         if names in self._known:
             return self._known[names]
         if names:

@@ -1,4 +1,4 @@
-r"""What data determined, with a prior and by likelihood alone, and what it says of the stress.
+r"""The parameters that data determine, with a prior and by likelihood alone, and the stress.
 
 **Combinations.** Stiffness and load can rise together and leave the body where it is; a table of
 marginals hides that. With covariances :math:`S` of the posterior and :math:`P` of the prior, in
@@ -255,7 +255,7 @@ def profile_likelihood(posterior: Posterior, name: str, points: int = 21) -> Pro
 
 
 def _crossing(values: np.ndarray, drop: np.ndarray, otherwise: float) -> float:
-    """Return where the drop first crosses :data:`DROP_95`."""
+    """Return the value at which the drop first crosses :data:`DROP_95`."""
     beyond = np.flatnonzero(drop > DROP_95)
     if not beyond.size:
         return otherwise

@@ -1,4 +1,4 @@
-r"""Simulation-based calibration: whether posteriors mean what they say.
+r"""Simulation-based calibration: a check that credible intervals cover as often as they claim.
 
 Draw :math:`\theta^* \sim p(\theta)` and data :math:`y \sim p(y \mid \theta^*)`, and sample
 :math:`p(\theta \mid y)`. If model, forward map and sampler are right, :math:`\theta^*` and the L
@@ -253,7 +253,7 @@ def _replicates(
 def _log_likelihoods(
     model: Model, draws: Mapping[str, Any], data: Mapping[str, np.ndarray]
 ) -> np.ndarray:
-    """Log likelihood of the data at draws of any shape, of their shape."""
+    """Return the log likelihood of the data at draws of any shape, in this shape."""
     shape = np.shape(draws[model.names[0]])
     table = {name: np.reshape(draws[name], (1, -1)) for name in model.names}
     terms = predictions.log_likelihood(model, table, data)

@@ -55,7 +55,10 @@ def seen_columns(G: np.ndarray) -> np.ndarray:
 
 
 def posterior_of_sets(G: np.ndarray, y: np.ndarray, names: Sequence[str]) -> SetPosterior:
-    """Return the posterior of the sets of those columns ``names`` of G (n, p) that are not zero."""
+    """Return the posterior probability of every subset of candidate terms.
+
+    Columns of the design matrix G (n, p) that are zero are left out, with their ``names``.
+    """
     seen = seen_columns(G)
     G, names = G[:, seen], [names[k] for k in seen]
     size, p = float(np.sqrt(np.mean(y**2))), G.shape[1]
@@ -130,7 +133,7 @@ class SetPosterior:
 
     @property
     def moments(self) -> dict[str, tuple[float, float]]:
-        """Mean and sd in kPa of each modulus where its term is present, signs not regarded."""
+        """Mean and sd in kPa of each modulus given that its term is present, without its sign."""
         sums = np.zeros((len(self.names), 3))
         for i, j in np.argwhere(self.weights > 1e-4 * self.weights.max()):
             if S := list(self.sets[i]):
@@ -167,7 +170,7 @@ class SetPosterior:
 
 @dataclass(frozen=True)
 class _LeastSquares:
-    """The data's share in columns of length 1.
+    """The normal equations of the data in columns of length 1.
 
     gram : G^T G, (p, p). projected : G^T y, (p,). count : the number n of data.
     """

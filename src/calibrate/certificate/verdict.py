@@ -174,7 +174,7 @@ def judge(evidence: Evidence) -> Certificate:
 
 
 def _mesh(mesh: MeshChange) -> tuple[bool | None, list[Finding]]:
-    """Return whether the posterior stays on a finer mesh, ``None`` if undecided, and findings."""
+    """Return whether a finer mesh keeps the posterior, ``None`` if undecided, and findings."""
     if mesh.homogeneous:
         remedy = _SAY_GRIPS if mesh.homogeneous == NOBODY_SAID else ""
         return True, [(f"grips: the piece is taken to deform evenly, {mesh.homogeneous}", remedy)]
@@ -265,7 +265,7 @@ def _weights(tail: Tail) -> tuple[Verdict, list[Finding]] | None:
 
 
 def _faults(evidence: Evidence) -> Iterator[Finding]:
-    """Yield what is wrong with FEM at the draws, and with the data, whatever FEM says of them."""
+    """Yield the faults of FEM at the draws and of the data; the figures play no part in them."""
     p = evidence.physics
     if evidence.box:
         yield in_words(evidence.box)

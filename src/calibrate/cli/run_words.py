@@ -92,7 +92,7 @@ def _add_run(parser: ArgumentParser, more: Sequence[str]) -> None:
 
 
 def plan_of(arguments: Namespace) -> Run | Problem | Members:
-    """Return what :func:`run_options` read: a run, or an experiment file's problem or members."""
+    """Return the run, or the experiment file's problem or members, from :func:`run_options`."""
     from calibrate.project.experiment import is_experiment_file, read_experiment
     from calibrate.project.run import SYNTHETIC, Run, with_absolute_paths
 

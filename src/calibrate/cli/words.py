@@ -47,7 +47,7 @@ class Parser(ArgumentParser):
             self.register("action", name, _Once)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Return what :mod:`argparse` does."""
+        """Parse as :mod:`argparse` does, without its record of repeated options."""
         arguments, rest = super().parse_known_args(args, namespace)
         if hasattr(arguments, _SEEN):
             delattr(arguments, _SEEN)
@@ -113,12 +113,12 @@ def command_of_kinds(about: str, **kinds: Command) -> Command:
 
 
 def option(flag: str, metavar: Any = None, help: str | None = None, **about: Any) -> Option:
-    """Return what adds one option, as :mod:`argparse` describes it."""
+    """Return the function that adds one option, with the arguments of :mod:`argparse`."""
     return lambda parser: parser.add_argument(flag, metavar=metavar, help=help, **about)
 
 
 def flag(name: str, text: str) -> Option:
-    """Return what adds an option without a value."""
+    """Return the function that adds an option without a value."""
     return lambda parser: parser.add_argument(name, action="store_true", help=text)
 
 

@@ -18,7 +18,7 @@ _INSIDE, _OUTSIDE, _BAND = BLUE, VERMILION, "0.85"  # blue and vermilion differ 
 
 
 def draw_calibration(calibration: Calibration, title: str, path: str | Path) -> None:
-    """Draw each quantity's distribution function of ranks less the uniform one, with its band.
+    """Draw the difference of each quantity's distribution of ranks to the uniform one, and a band.
 
     A hump above zero: truths lie low among the draws. Steep ends, flat middle: the posterior is too
     narrow. Flat ends, steep middle: it is too wide.

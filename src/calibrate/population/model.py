@@ -284,7 +284,7 @@ def _shared_names(members: Mapping[str, Model], names: Sequence[str] | None) -> 
 
 
 def _common_parameter(members: Mapping[str, Model], name: str) -> Parameter:
-    """Return the parameter of the unknown ``name``, which has to be the same for every member."""
+    """Return the parameter of the unknown ``name``; InputError where members differ in it."""
     scenes = {member: model.forward.scene for member, model in members.items()}
     base = split(name)[0]
     parameters = {m: s.parameters[s.parameter_names.index(base)] for m, s in scenes.items()}

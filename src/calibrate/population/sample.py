@@ -169,7 +169,7 @@ def _on_scales(model: PopulationModel, draws: Mapping[str, Any]) -> np.ndarray:
 def _provenance(
     model: PopulationModel, options: NUTSOptions, alone: str, seed: int
 ) -> dict[str, Any]:
-    """Return what a posterior was made of, as plain JSON values."""
+    """Return the priors, maps and settings behind a posterior, as plain JSON values."""
     return {
         "shared": list(model.shared),
         "prior_median": {name: describe_distribution(d) for name, d in model.median.items()},

@@ -1,4 +1,4 @@
-r"""The draws in a few numbers, and what is wrong with a run or with its data, in words.
+r"""A summary of draws in a few numbers, and sentences on the faults of a run and of its data.
 
 Data simulated from draws of the posterior tell whether the data could have come from the model.
 Distances of simulated and measured data from a prediction say how much of the one is as far off as
@@ -55,7 +55,7 @@ _NAMED = 3  # largest number of parameters that a sentence names
 
 
 Fault = tuple[str, str]
-"""A statement about what is wrong, and a remedy; empty where there is none."""
+"""A statement about a fault, and a remedy; the remedy may be empty."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Sampling:
 
 
 def sampling_faults(s: Sampling, box: Sequence[BoxEnd] = ()) -> Iterator[Fault]:
-    """Yield what makes draws useless for a certificate; NaN is at fault.
+    """Yield the faults that make draws useless for a certificate; NaN counts as a fault.
 
     box : the ends of ranges that end the posterior, so that no prior is to be narrowed.
     """
@@ -100,7 +100,7 @@ def sampling_faults(s: Sampling, box: Sequence[BoxEnd] = ()) -> Iterator[Fault]:
 
 
 def map_fault(errors: Mapping[str, float], moves: float = np.nan) -> Fault | None:
-    """Return what the forward map misses most, if by more than a share of the noise or of a mean.
+    """Return the fault of the forward map, if its error exceeds limits on data or on means.
 
     errors : the distance of the map's data from FEM's at the draws, in noise sd, by observation.
     moves : the largest move of a posterior mean that FEM is expected to make, in its sd; NaN where
@@ -170,7 +170,7 @@ def diagnose(
     attributes: Mapping[str, Any],
     box: Sequence[BoxEnd] = (),
 ) -> Iterator[str]:
-    """Yield a sentence for each thing that is wrong, with what to do; nothing if nothing is.
+    """Yield one sentence per problem, with its remedy. Yield nothing for a healthy run.
 
     Parameters
     ----------

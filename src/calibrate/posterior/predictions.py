@@ -1,4 +1,4 @@
-r"""What a model predicts at draws: replicated data, and the log likelihood of each datum.
+r"""Predictions of a model at draws: replicated data, and the log likelihood of each datum.
 
 Replicates :math:`y^\text{rep} \sim p(y \mid \theta_s)` are drawn at draws of the posterior and of
 the prior. The log likelihood :math:`\log p(y_i \mid \theta_s)` of every datum at every draw is what
@@ -59,7 +59,7 @@ class Prior(NamedTuple):
 def log_likelihood(
     model: Model, draws: Draws, data: Mapping[str, Any], means: Draws | None = None
 ) -> dict[str, np.ndarray]:
-    """Log likelihood of each datum at each draw, (chains, draws, *shape), by observation.
+    """Return the log likelihood of each datum at each draw, (chains, draws, *shape), by name.
 
     Where noise correlates in space, given all other data of the observation. Data of a noise that
     has no density of a single one have one number a draw instead, (chains, draws).

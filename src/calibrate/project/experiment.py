@@ -140,7 +140,7 @@ def _without(table: Mapping[str, Any], entries: Mapping[str, Any]) -> dict[str, 
 
 
 def experiment_schema() -> dict[str, Any]:
-    """Return the schema (draft 2020-12). It admits what the reader admits of any scene and data."""
+    """Return the JSON Schema (draft 2020-12); it accepts the files that the reader accepts."""
     from calibrate.project.members import Members, Shared  # a room
 
     run: Any = _entries()

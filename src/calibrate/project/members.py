@@ -52,7 +52,7 @@ _SAME_MODEL = (
 
 @dataclass(frozen=True)
 class Shared:
-    """What members of a population have in common, as of :func:`calibrate.hierarchy`.
+    """The settings that all members of a population share, as in :func:`calibrate.hierarchy`.
 
     shared : unknowns that follow the population; by default all that every member has.
     median : median and relative sd of a log-normal prior of the population's median, by name.
@@ -132,16 +132,13 @@ def infer_members(
         posteriors: dict[str, Posterior] = {}
         verdicts: dict[str, str] = {}
         for name, run in plan.members.items():
-            member_folder = folder / MEMBERS / name
-            posteriors[name] = _posterior_of(plan.problem(name), member_folder, force, progress)
+            at = folder / MEMBERS / name
+            posteriors[name] = _posterior_of(plan.problem(name), at, force, progress)
             if certify:
                 verdicts[name] = (
-                    _written_verdict(member_folder)
+                    _written_verdict(at)
                     or certify_and_keep(
-                        posteriors[name],
-                        member_folder,
-                        load_steps=run.load_steps,
-                        progress=progress,
+                        posteriors[name], at, load_steps=run.load_steps, progress=progress
                     ).verdict
                 )
         hierarchy = _sample_together(plan, posteriors, folder / SAMPLING, progress=progress)

@@ -1,4 +1,4 @@
-"""The one description of a calibration: what to calibrate, and how.
+"""The one description of a calibration: scene, data, model, and sampler.
 
 A :class:`Run` is an experiment file, ``run.json``, and what the command line's options say. Its
 fields are the keys of both files and the names of the options; its docstring describes the keys in
@@ -34,7 +34,7 @@ SYNTHETIC = "synthetic"
 
 @dataclass(frozen=True)
 class Run:
-    """What to calibrate and how.
+    """The description of a calibration.
 
     scene : a scene's name or file.
     root : the folder of the published data.

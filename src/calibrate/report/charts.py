@@ -51,7 +51,7 @@ def names_with_units(posterior: Posterior) -> dict[str, str]:
 
 
 def against_data(posterior: Posterior) -> Iterator[tuple[str, go.Figure]]:
-    """Yield a chart for each observation: the data against what the posterior predicts."""
+    """Yield a chart for each observation: the data against the posterior predictions."""
     tree = posterior.tree
     if "posterior_predictive" not in tree.children:
         return

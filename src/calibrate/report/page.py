@@ -1,4 +1,4 @@
-"""The page of a posterior: verdict, data, parameters, body, what is known, how to repeat it."""
+"""The page of a posterior: verdict, data, parameters, body, known combinations, settings."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def _verdict(
 
 
 def _basis(certificate: dict[str, Any]) -> Iterator[str]:
-    """Yield the sentences that say what a verdict rests on, and its limits."""
+    """Yield sentences on the evidence behind a verdict, and on its limits."""
     mesh = certificate.get("mesh") or {}
     where = "between the grips" if mesh.get("gripped") else "on a finer mesh"
     runs = f"Judged by {certificate['draws']} FEM runs, {certificate['failed']} failed"
@@ -168,7 +168,7 @@ def _known(posterior: Posterior) -> list[Markup]:
 
 
 def _sheet(posterior: Posterior) -> list[Markup]:
-    """Return what forces tell of a sheet: its moduli times its thickness, which was assumed."""
+    """Return the product of moduli and assumed thickness that forces on a sheet determine."""
     model, scene = posterior.model, posterior.model.forward.scene
     thickness, width, _ = np.sort(np.ptp(scene.mesh.nodes, axis=0))
     forces = any(part.unit == "N" for part in model.observe.parts.values())
@@ -188,7 +188,7 @@ def _sheet(posterior: Posterior) -> list[Markup]:
 
 
 def _terms(posterior: Posterior) -> list[Markup]:
-    """Return which terms a specimen's law needs, where its data are linear in the moduli."""
+    """Return the terms that a specimen's law needs, where its data are linear in the moduli."""
     if not is_specimen(posterior.model.forward.scene):
         return []
     try:

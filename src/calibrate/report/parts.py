@@ -1,4 +1,4 @@
-"""The blocks that pages are made of, and the template that renders them (``page.html.j2``)."""
+"""The blocks of pages, and the template that renders them (``page.html.j2``)."""
 
 from __future__ import annotations
 

@@ -230,8 +230,7 @@ class CachedEmulator:
             safe = jnp.where(inside, theta, scene.centre)
             free_values = offset + modes @ self.coefficients(safe)
             at = scene.resolve(safe)
-            moving = sum(at[name] * row for name, row in prescribed.items())
-            return free_values + moving, inside
+            return free_values + sum(at[name] * c for name, c in prescribed.items()), inside
 
         return values
 

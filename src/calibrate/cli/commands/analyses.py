@@ -1,4 +1,4 @@
-"""``calibrate identify``, ``effects`` and ``sensitivity``: what data determine, what matters."""
+"""``calibrate identify``, ``effects`` and ``sensitivity``: analyses of a model and its data."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @command(run_options("seed"), help="of data not yet measured, from a scene")
 def _before(arguments: Namespace) -> Answer:
-    """Find what the observations would determine."""
+    """Find the parameters that the observations would determine."""
     from calibrate.analysis.expected import expected_precision
     from calibrate.analysis.identifiability import products_in_words
     from calibrate.cli.run_words import problem_of
@@ -53,7 +53,7 @@ def _before(arguments: Namespace) -> Answer:
     help="of a posterior that calibrate infer wrote",
 )
 def _after(arguments: Namespace) -> Answer:
-    """Find what a posterior's data determined, and which measurement would add most."""
+    """Find the parameters that data determined, and the measurement that would add most."""
     from calibrate.analysis.expected import next_measurement
     from calibrate.analysis.identifiability import (
         identify,

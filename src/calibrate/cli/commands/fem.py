@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def _solved(scene: Scene, theta: Any, solution: Solution | Unloaded) -> tuple[dict[str, Any], str]:
-    """Return what a solve came to, as plain JSON and in a line."""
+    """Return the outcome of a solve, as plain JSON and in a line."""
     from emulator.fem import Status
 
     status = Status(int(solution.status))
@@ -209,7 +209,7 @@ def _add_design(parser: ArgumentParser) -> None:
     "calibrate train left_ventricle --campaign runs.zarr --out emulator",
 )
 def campaign(arguments: Namespace) -> Answer:
-    """Solve what the store lacks, and count rows by their status."""
+    """Solve the rows that the store lacks, and count rows by their status."""
     from calibrate.project.campaigns import fill, question
     from emulator.fem import NewtonOptions
     from emulator.fem.campaign.store import count_statuses

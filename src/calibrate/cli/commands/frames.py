@@ -144,7 +144,7 @@ def _split(word: str, flag: str, usage: str) -> list[str]:
 
 
 def _measured(data: Mapping[str, Any], out: str) -> Answer:
-    """Return a table of what was measured."""
+    """Return a table of the measured data."""
     import numpy as np
 
     rows, result = [], {}

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     epilog="example: calibrate init ventricle.msh, then calibrate simulate ventricle.toml",
 )
 def init(arguments: Namespace) -> Answer:
-    """Write the scene file, and say what the mesh has."""
+    """Write the scene file, and describe the mesh."""
     from emulator.core.cells import SPREADSHEETS, TEXT
     from emulator.scenes.draft import draft_scene
 
@@ -75,7 +75,7 @@ def init(arguments: Namespace) -> Answer:
 
 
 def _init_specimen(table_path: Path, out: str | Path, arguments: Namespace) -> Answer:
-    """Write the files for a table, and say what was guessed."""
+    """Write the files for a table, and list the guesses."""
     from calibrate.project.specimen import draft_specimen
     from emulator.scenes.specimen import measured_states
 

@@ -122,7 +122,7 @@ def train(arguments: Namespace) -> Answer:
 
 
 def _train_grips(scene: Scene, arguments: Namespace) -> Answer:
-    """Learn and write what the grips of a specimen add to its stresses."""
+    """Train and write the model of the stresses that the grips of a specimen add."""
     from emulator.surrogates.gripped import RUNS, learn_grips
 
     out = Path(arguments.out)
