@@ -122,7 +122,7 @@ class Explorer:
         return result
 
     def compare(self, position: Mapping[str, str]) -> dict[str, Any]:
-        """Solve FEM at the same theta, and return the emulator's distance from it."""
+        """Solve FEM at the theta of the request, and return the emulator's distance from it."""
         theta = self.theta(position)
         with self._slow:
             solution = self._simulator.solve(theta, self._forward(theta))

@@ -109,7 +109,7 @@ class Calibration:
         return not any(self.outside().values())
 
     def coverage(self, probability: float = 0.95) -> dict[str, dict[float, tuple[float, ...]]]:
-        """Return the share of central intervals that cover, with its own interval, by quantity.
+        """Return the fraction of central intervals that cover, with its error bounds, by quantity.
 
         The interval is Clopper and Pearson's, of ``probability``.
         """

@@ -148,9 +148,9 @@ class SetPosterior:
         return moments
 
     def predicted(self, i: int, data: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return how the set numbered i predicts other data (k,), in sds of their noise.
+        """Predict other data (k,) by the set numbered i, in sds of their noise.
 
-        Returned are the mean, the probability of less and the log density of each point, (k,).
+        Return the mean, the probability of less and the log density of each point, (k,).
 
         columns : the data (k, p) that one unit of each modulus makes.
         """

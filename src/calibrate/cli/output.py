@@ -20,7 +20,7 @@ _UNLIMITED = 1_000_000  # columns when the output is a file or a pipe
 
 
 def check_plotly(what: str) -> None:
-    """Refuse ``what`` needs Plotly in one line, where that is missing."""
+    """Raise InputError for ``what``, which needs Plotly, where Plotly is missing."""
     if find_spec("plotly") is None:
         raise InputError(f"{what} needs plotly: pip install 'soft-tissue-calibrate[plot]'")
 

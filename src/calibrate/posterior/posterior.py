@@ -55,7 +55,7 @@ class Posterior(TableRepr):
     data: Data
 
     def summary_rows(self) -> tuple[str, list[tuple[str, str]]]:
-        """Return mean and sd of every unknown, the draws, and what is wrong with them."""
+        """Return mean and sd of every unknown, the number of draws, and the faults of the run."""
         table, sizes = self.summary(), self.tree["posterior"].sizes
         rows = [(name, f"{row['mean']:.4g} +- {row['sd']:.2g}") for name, row in table.items()]
         worst = max(row["r_hat"] for row in table.values())

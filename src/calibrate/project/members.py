@@ -190,7 +190,7 @@ def verdicts_in(plan: Members, folder: str | Path) -> dict[str, str]:
 
 
 def _posterior_of(problem: Problem, folder: Path, force: bool, progress: bool) -> Posterior:
-    """Return a member's own posterior: the one in ``folder`` if it is of this problem."""
+    """Return the posterior of one member: the one in ``folder`` if it is of this problem."""
     if (folder / POSTERIOR).exists() and not force:
         run, posterior = read_posterior(folder)
         if run == problem.run and is_of(posterior, with_data(problem)):

@@ -367,7 +367,7 @@ def _check_lengths(values: np.ndarray, name: str, where: str) -> np.ndarray:
 
 
 def _own_node_sets(mesh: Mesh) -> Sets:
-    """Return the node sets that do not follow from the facet set of the same name."""
+    """Return the node sets that do not follow from the facet set of their name."""
     return {
         name: nodes
         for name, nodes in mesh.node_sets.items()

@@ -133,7 +133,7 @@ def tetrahedralise(
 
 
 def _cells(gmsh: Any, corners: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the nodes in the order of their tags, those given first, and the elements."""
+    """Return the nodes in the order of their tags, and the elements; input nodes come first."""
     tags, places, _ = gmsh.model.mesh.getNodes()
     order = np.argsort(tags)
     _, rows = gmsh.model.mesh.getElementsByType(_TYPES[corners])

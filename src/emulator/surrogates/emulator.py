@@ -246,7 +246,7 @@ class CachedEmulator:
         return lambda theta: work(jnp.where(scene.space.contains(theta), theta, scene.centre))
 
     def at(self, nodes: np.ndarray) -> CachedEmulator:
-        """Return the same map over ``nodes``, which must be among those cached."""
+        """Return this map restricted to ``nodes``, which must be among its nodes."""
         rows = rows_of(self, nodes)
         return replace(self, part=self.part.at(rows), nodes=self.nodes[rows])
 
