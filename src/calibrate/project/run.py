@@ -195,7 +195,7 @@ def _by_name[T](
 
 
 def with_absolute_paths(entries: Mapping[str, Any], folder: Path = Path()) -> dict[str, Any]:
-    """Return entries of a run that mean the same in every folder.
+    """Return the entries of a run with absolute paths, so that they hold in every folder.
 
     Files and folders become absolute; names of built-in scenes and shipped emulators stay. A file
     of a prior becomes its content: a run must not change with the file.

@@ -155,7 +155,7 @@ class FibreAngles:
         return tuple(Quantity(name, "deg", -360.0, 360.0) for name in self.shares)
 
     def checked(self, mesh: Mesh) -> FibreAngles:
-        """Return the same rotation with frozen arrays (m, q, ...).
+        """Return this rotation with frozen arrays (m, q, ...).
 
         Raises
         ------

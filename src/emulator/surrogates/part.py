@@ -54,7 +54,7 @@ def arrays_of(parts: Mapping[str, EmulatorPart]) -> dict[str, Any]:
 
 
 class ArrayPart:
-    """A part whose fields are all arrays, or named tuples of arrays: what files keep of it.
+    """A part whose fields are all arrays, or named tuples of arrays; files keep all of them.
 
     A dataclass that inherits from this class has its arrays written and read by their names; those
     of a named tuple ``warp`` are called ``warp/centre`` and so on.
