@@ -17,6 +17,7 @@ from emulator.mechanics.laws import LAWS
 from emulator.scenes.loads import LOADS
 from emulator.scenes.supports import SUPPORTS
 from emulator.surrogates.registry import FORWARD_MAPS
+from rooms import room_of
 
 ROOT = Path(__file__).resolve().parents[1]
 REGISTRIES = {
@@ -75,21 +76,27 @@ def test_each_kind_has_a_file_where_the_table_says_and_a_line_in_its_registry(th
     folder = ROOT / pattern.removesuffix("<name>.py")
     line = ast.parse((ROOT / registry).read_text(encoding="utf-8"))
     imported = {
-        node.module.rsplit(".", 1)[1]: {name.name for name in node.names}
+        _dotted(folder / f"{node.module.rsplit('.', 1)[1]}.py"): {name.name for name in node.names}
         for node in ast.walk(line)
         if isinstance(node, ast.ImportFrom) and node.module and "." in node.module
     }
+    modules = [(m, words) for m, words in imported.items() if _file(m).is_file()]
+    for node in ast.walk(line):  # what a room offers is in a file of the room
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "offered":
+            module, word = (argument.value for argument in node.args)
+            assert room_of(module) is not None
+            modules.append((module, {word}))
     for name, kind in REGISTRIES[thing].items():
         homes = [
             module
-            for module, names in imported.items()
-            if any(
-                getattr(import_module(_dotted(folder / f"{module}.py")), word, None) is kind
-                for word in names
-                if (folder / f"{module}.py").is_file()
-            )
+            for module, words in modules
+            if any(getattr(import_module(module), word, None) is kind for word in words)
         ]
         assert len(homes) == 1, f"{name} is not imported by its registry from a file in {folder}"
+
+
+def _file(module):
+    return ROOT / "src" / f"{module.replace('.', '/')}.py"
 
 
 def _dotted(path):
