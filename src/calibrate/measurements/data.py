@@ -79,9 +79,9 @@ def read_measurements(
     data: dict[str, np.ndarray] = {}
     known: dict[str, float] = {}
     paths: Mapping[str, str | Path] = files if isinstance(files, Mapping) else {"": files}
-    for given, path in paths.items():
-        if paths is files and (not given or set("@/+") & set(given)):
-            raise InputError(f"data: load state '{given}'; give it a name without @, / and +")
+    for prefix, path in paths.items():
+        if paths is files and (not prefix or set("@/+") & set(prefix)):
+            raise InputError(f"data: load state '{prefix}'; give it a name without @, / and +")
         file = Path(path)
         if not file.is_file():
             raise InputError(f"data file {path} does not exist")
@@ -89,8 +89,8 @@ def read_measurements(
             raise InputError(f"data file {path} is a spreadsheet; save it as CSV")
         of_cells = file.suffix.lower() in (*TEXT, *SPREADSHEETS)
         read: Reader = read_csv if of_cells else read_netcdf
-        for own, table in read(file).items():
-            state = ".".join(filter(None, (given, own)))
+        for inner, table in read(file).items():
+            state = ".".join(filter(None, (prefix, inner)))
             known |= {in_state(name, state): value for name, value in table.known.items()}
             for name, (part, values) in _observed(scene, table, state).items():
                 parts[name], data[name] = part, values

@@ -110,24 +110,24 @@ _UNITS = (
 
 def _without_units(cells: Cells) -> Cells:
     """Return a table with columns such as ``volume [L]`` in the project's units, without them."""
-    own: dict[str, tuple[str, float]] = {}
+    conversions: dict[str, tuple[str, float]] = {}
     for word in cells.words:
         name, unit = with_unit(word)
-        found = next((each for each in _UNITS if each[0].fullmatch(name)), None)
-        if unit and found is not None:
-            if name in (*cells.words, *(known for known, _ in own.values())):
+        usual = next((entry for entry in _UNITS if entry[0].fullmatch(name)), None)
+        if unit and usual is not None:
+            if name in (*cells.words, *(known for known, _ in conversions.values())):
                 raise InputError(f"data file {cells.path}: column '{name}' is there twice")
-            own[word] = name, factor(word, unit, *found[1:])
-    if not own:
+            conversions[word] = name, factor(word, unit, *usual[1:])
+    if not conversions:
         return cells
 
     def converted(row: int, word: str, cell: str) -> tuple[str, str]:
-        name, each = own.get(word, (word, 1.0))
-        number = cells.number(row, word, gaps=True) if each != 1.0 else 0.0
-        return name, cell if each == 1.0 or np.isnan(number) else repr(float(number * each))
+        name, ratio = conversions.get(word, (word, 1.0))
+        number = cells.number(row, word, gaps=True) if ratio != 1.0 else 0.0
+        return name, cell if ratio == 1.0 or np.isnan(number) else repr(float(number * ratio))
 
     rows = {k: dict(converted(k, w, c) for w, c in row.items()) for k, row in cells.rows.items()}
-    return cells._replace(words=[own.get(w, (w, 1.0))[0] for w in cells.words], rows=rows)
+    return cells._replace(words=[conversions.get(w, (w, 1.0))[0] for w in cells.words], rows=rows)
 
 
 def read_csv(path: Path) -> dict[str, CSVTable]:
@@ -153,11 +153,11 @@ def read_csv(path: Path) -> dict[str, CSVTable]:
     return {
         state: CSVTable(
             whole._replace(
-                words=[w for w in words if w != STATE and any(row[w] for row in own.values())],
-                rows=own,
+                words=[w for w in words if w != STATE and any(row[w] for row in part.values())],
+                rows=part,
             )
         )
-        for state, own in states.items()
+        for state, part in states.items()
     }
 
 
@@ -215,10 +215,12 @@ def read_netcdf(path: Path) -> dict[str, NetCDFTable]:
             f"data file {path} is neither CSV ({', '.join(TEXT)}) nor readable netCDF"
         ) from error
     # Coordinates without values of their own belong to no state.
-    own = [str(word) for word in data.variables if word not in data.dims]
+    variables = [str(word) for word in data.variables if word not in data.dims]
     return {
-        state: NetCDFTable(path, [base for base, s in map(split, own) if s == state], data, state)
-        for state in states_of(own, f"data file {path}")
+        state: NetCDFTable(
+            path, [base for base, s in map(split, variables) if s == state], data, state
+        )
+        for state in states_of(variables, f"data file {path}")
     }
 
 
