@@ -150,6 +150,19 @@ def _name(node: ast.AST) -> str:
     return node.arg if isinstance(node, ast.arg) else str(getattr(node, "name", ""))
 
 
+def spine() -> list[str]:
+    """Return the files from a law to a verdict, as ARCHITECTURE.md has them, in its order."""
+    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    chapter = text[text.index("## The spine") : text.index("## Floors")]
+    return re.findall(r"`((?:emulator|calibrate)/[^`]+\.py)`", chapter)
+
+
+def lines_of_spine() -> list[str]:
+    """Return the lines of the spine's files."""
+    files = [ROOT / "src" / file for file in spine()]
+    return [line for file in files for line in file.read_text(encoding="utf-8").splitlines()]
+
+
 FIGURES: dict[str, tuple[int, Callable[[], list[str]]]] = {
     "class names with two meanings": (11, ambiguous_classes),
     "files with a table of units": (6, tables_of_units),
@@ -159,6 +172,8 @@ FIGURES: dict[str, tuple[int, Callable[[], list[str]]]] = {
     "members of Observation": (33, observation_members),
     "public names": (144, public_names),
     "deep imports of studies": (566, deep_imports_of_studies),
+    "files of the spine": (43, spine),
+    "lines of the spine": (10_856, lines_of_spine),
     f"functions above {LONGEST} lines": (21, long_functions),
     **{f"names '{w}'": (most, partial(names_called, w)) for w, most in WORDS.items()},
 }
