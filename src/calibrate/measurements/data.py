@@ -148,7 +148,7 @@ def _layouts(file: DataTable) -> dict[str, tuple[type[Observation], Layout]]:
     used: set[str] = set()
     for kind in OBSERVATIONS.values():
         for name, layout in kind.layouts(file.words).items():
-            words = [word for field in layout.fields for word in file.words_of(field)]
+            words = file.words_of(layout)
             if not set(words) <= set(file.words):
                 partial.append(words)
             elif name not in complete:
@@ -161,7 +161,7 @@ def _layouts(file: DataTable) -> dict[str, tuple[type[Observation], Layout]]:
     lacking = [[w for w in words if w not in file.words] for words in partial]
     fault = f"{file.what} '{min(lacking, key=len)[0]}' is missing" if partial else "no data"
     every = " or ".join(
-        ",".join(word for field in layout.fields for word in file.words_of(field))
+        ",".join(file.words_of(layout))
         for name, kind in OBSERVATIONS.items()
         for layout in kind.layouts((name,)).values()
     )

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from calibrate.measurements.observation import Block, DataField
+from calibrate.measurements.observation import Block, DataField, Layout
 from calibrate.state_names import in_state, split, states_of
 from emulator.core import store
 from emulator.core.cells import TEXT, Cells, read_cells
@@ -72,9 +72,9 @@ class CSVTable:
                     )
         return values
 
-    def words_of(self, field: DataField) -> tuple[str, ...]:
-        """Return the words that hold ``field`` in a file of this format."""
-        return field.columns
+    def words_of(self, layout: Layout) -> list[str]:
+        """Return the words that hold an observation in a file of this format."""
+        return [word for field in layout.fields for word in field.columns]
 
     def arrays(self, fields: Sequence[DataField], others: Collection[str]) -> dict[str, np.ndarray]:
         """Return arrays of numbers by variable, NaN where a measured value is missing.
@@ -186,9 +186,9 @@ class NetCDFTable:
                 raise InputError(f"data file {self.path}: variable '{word}' is not a number")
         return {word.removeprefix(KNOWN): float(array) for word, array in arrays.items()}
 
-    def words_of(self, field: DataField) -> tuple[str, ...]:
-        """Return the field's variable."""
-        return (field.variable,)
+    def words_of(self, layout: Layout) -> list[str]:
+        """Return the fields' variables."""
+        return [field.variable for field in layout.fields]
 
     def arrays(
         self, fields: Sequence[DataField], others: Collection[str] = ()
