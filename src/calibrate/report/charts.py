@@ -53,7 +53,7 @@ def names_with_units(posterior: Posterior) -> dict[str, str]:
 
 
 def against_data(posterior: Posterior) -> Iterator[tuple[str, go.Figure]]:
-    """Yield a chart for each observation: the data against what the posterior predicts."""
+    """Yield a chart for each observation: the data against the posterior predictions."""
     tree = posterior.tree
     if "posterior_predictive" not in tree.children:
         return
@@ -236,7 +236,7 @@ def volume_band(posterior: Posterior) -> go.Figure | None:
     )  # fmt: skip
     figure.add_scatter(
         x=middle, y=p, mode="lines", line_color=BLUE, name="median",
-        text=[in_mmhg(each) for each in p], hovertemplate="%{x:.1f} mL at %{text}",
+        text=[in_mmhg(pressure) for pressure in p], hovertemplate="%{x:.1f} mL at %{text}",
     )  # fmt: skip
     figure.add_scatter(
         x=[curve.rest, middle[0]], y=[0.0, p[0]], line={"color": BLUE, "dash": "dot"},
@@ -304,5 +304,5 @@ def _add_klotz(
     figure.add_scatter(
         x=np.asarray(klotz.volume(p)), y=p, mode="lines", line={"color": "gray", "dash": "dash"},
         name=f"left ventricles (Klotz et al. 2006), through the {through} at {in_mmhg(pressure)}",
-        text=[in_mmhg(each) for each in p], hovertemplate="%{x:.1f} mL at %{text}",
+        text=[in_mmhg(kpa) for kpa in p], hovertemplate="%{x:.1f} mL at %{text}",
     )  # fmt: skip
