@@ -177,8 +177,8 @@ last = f"displacement@{list(pulls)[-1]}"
 mean = {k: row["mean"] for k, row in found["a field"].summary().items()}
 predicted = found["a field"].model.predict({k: mean[k] for k in truth})[0][last]
 left = np.asarray(models["a field"][1][last]) - np.asarray(predicted)
-seen = found["a field"].model.observe.parts[last]
-where, along = seen.points, seen.filled(left)[:, 0]
+seen = found["a field"].model.observe
+where, along = seen.parts[last].points, seen.filled(last, left)[:, 0]
 figure, axis = plt.subplots(figsize=(5, 4))
 dots = axis.scatter(*where[:, :2].T, c=1e3 * along, cmap="coolwarm", vmin=-100, vmax=100)
 axis.set(aspect="equal", xlabel="x (mm)", ylabel="y (mm)", title="what the mean misses along x")

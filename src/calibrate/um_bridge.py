@@ -37,13 +37,13 @@ class ForwardModel:
     """
 
     def __init__(self, forward: ForwardMap, observe: Observation | Observations) -> None:
-        parts = dict(observations(observe).parts)
-        if observations(observe).states != ("",):
+        several = observations(observe)
+        if several.states != ("",):
             raise InputError("serve: observations of several load states; take one at a time")
         self.scene, self.label = forward.scene, forward.label
-        self._outputs = Outputs(forward, parts, what="serve")
+        self._outputs = Outputs(forward, several, what="serve")
         self._alone = threading.Lock()
-        self.units = {name: part.unit for name, part in parts.items()}
+        self.units = {name: part.unit for name, part in several.parts.items()}
         self.output_sizes = [place.stop - place.start for place in self._outputs.places.values()]
 
     def answer(self, what: str, request: Mapping[str, Any]) -> dict[str, Any]:

@@ -187,7 +187,7 @@ def expected_precision(
         covariances = np.linalg.inv(np.asarray(by_size) + np.linalg.inv(before))
     sd = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)).mean(axis=0)
     ratio = sd / np.sqrt(np.diagonal(before))
-    many = sum(int(np.prod(part.shape)) for part in model.observe.parts.values())
+    many = sum(int(np.prod(shape)) for shape in model.observe.shapes.values())
     best = combinations(model, covariances.mean(axis=0), before, mean)[:many]
     return {"sd": dict(zip(names, ratio.tolist(), strict=True)), "combinations": best}
 

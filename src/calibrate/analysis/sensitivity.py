@@ -337,8 +337,8 @@ def sensitivity(
     scene = forward.scene
     if observe is None and not field:
         raise InputError("sensitivity: give something to observe, or ask for the field")
-    parts = {} if observe is None else dict(observations(observe).parts)
-    if observe is not None and observations(observe).states != ("",):
+    several = None if observe is None else observations(observe)
+    if several is not None and several.states != ("",):
         raise InputError("sensitivity: observations of several load states; take one at a time")
     prior = box_prior(scene) if prior is None else prior
     dependence = dependence_of(prior)
@@ -350,7 +350,7 @@ def sensitivity(
     prior, _ = fit_to(forward, prior)
     factors = Factors(scene.parameter_names, dict(groups or {}))
     datasets = {}
-    outputs = Outputs(forward, parts, field=field, what="sensitivity")
+    outputs = Outputs(forward, several, field=field, what="sensitivity")
     points = _design(factors, method, samples, seed)
     thetas = quantiles(prior, factors.names, jnp.asarray(points))
     values, slopes = outputs.values(thetas), None
@@ -360,7 +360,8 @@ def sensitivity(
     for name, entries in outputs.places.items():
         some = None if slopes is None else slopes[:, entries]
         data = _analysed(factors, method, seed, points, values[:, entries], some)
-        datasets[name] = data.assign_attrs(unit="mm" if name == FIELD else parts[name].unit)
+        unit = several.parts[name].unit if several is not None and name != FIELD else "mm"
+        datasets[name] = data.assign_attrs(unit=unit)
         if name == FIELD:  # its output is the node of that number
             datasets[name] = datasets[name].assign_coords(output=outputs.nodes)
     about = {"forward": forward.label, "scene": scene.name, "method": method, "seed": seed}

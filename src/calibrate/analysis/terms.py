@@ -18,6 +18,7 @@ from jax.flatten_util import ravel_pytree
 from scipy.special import bdtr
 
 from calibrate.analysis.term_sets import PRESENT, posterior_of_sets, seen_columns
+from calibrate.measurements.specimens import SpecimenCurves
 from calibrate.noise import information_about_means
 from calibrate.statistical_model.model import Model
 from emulator.core.display import TableRepr
@@ -164,10 +165,11 @@ def find_terms(
 def _of_tests(model: Model) -> dict[str, np.ndarray]:
     """Return the entries (k,) of each test in the data as ``ravel_pytree`` orders them."""
     entries, begin = dict[str, list[np.ndarray]](), 0
-    for _, part in sorted(model.observe.parts.items()):
-        for test, own in part.data_of_tests.items():
-            entries.setdefault(test, []).append(begin + own)
-        begin += int(np.prod(part.shape))
+    for name, part in sorted(model.observe.parts.items()):
+        if isinstance(part, SpecimenCurves):
+            for test, rows in part.tests(model.observe.entries.get(name)).items():
+                entries.setdefault(test, []).append(begin + rows)
+        begin += int(np.prod(model.observe.shapes[name]))
     return {test: np.concatenate(each) for test, each in entries.items()}
 
 
@@ -181,7 +183,7 @@ def _whitening(model: Model) -> np.ndarray:
         scales[name] = {
             key: prior.mean * np.sqrt(np.pi / 2.0) for key, prior in noise.priors.items()
         }
-    means = {name: jnp.zeros(part.shape) for name, part in model.observe.parts.items()}
+    means = {name: jnp.zeros(shape) for name, shape in model.observe.shapes.items()}
     information = np.asarray(information_about_means(model.noise, means, scales))
     return np.linalg.cholesky(information).T
 

@@ -43,7 +43,8 @@ class Word:
     """How the command line writes one field of a :class:`Run`.
 
     metavar : the name of the option's value in the help.
-    help : the option's help where it differs from the field's description.
+    help : the option's help where it differs from the field's description; ``{observations}`` and
+        ``{noises}`` stand for the words of their kinds.
     flag : the option where it is not the field's name.
     read : how several words become the field's value; by default there is one word.
     """
@@ -60,6 +61,8 @@ def run_options(*more: str) -> Option:
 
 
 def _add_run(parser: ArgumentParser, more: Sequence[str]) -> None:
+    from calibrate.measurements import OBSERVATIONS
+    from calibrate.noise import NOISES
     from calibrate.project.run import Run
     from emulator.core.schema import documented
 
@@ -74,7 +77,12 @@ def _add_run(parser: ArgumentParser, more: Sequence[str]) -> None:
         elif name in (*MODEL, *more):
             word = WORDS.get(name, Word())
             usual = "" if default in (MISSING, None) else f" (default {default})"
-            text = word.help or f"{texts[name].removesuffix('.').replace('%', '%%')}{usual}"
+            text = f"{texts[name].removesuffix('.').replace('%', '%%')}{usual}"
+            if word.help is not None:
+                text = word.help.format(
+                    observations=", ".join(kind.usage for kind in OBSERVATIONS.values()),
+                    noises=", ".join(kind.usage for kind in NOISES.values()),
+                )
             about: dict[str, Any] = {"metavar": word.metavar}
             if hints[name] is bool:
                 about = {"action": "store_const", "const": not default}
@@ -204,10 +212,8 @@ WORDS = {
     ),
     "observe": Word(
         "WHAT",
-        "observations of synthetic data (default nodes:20), e.g. nodes:N, landmarks:N, all, a node "
-        "set, 3,14,15, volume, volume:FACETSET, surface:FACETSET:N, strain:fibre:N, "
-        "segment_strain:circumferential, length:A:B, parameter:NAME; several joined by +, as in "
-        "landmarks:24+volume",
+        "observations of synthetic data (default nodes:20): {observations}; several joined by +, "
+        "as in landmarks:24+volume",
     ),
     "prior": Word(
         "NAME|FILE",
@@ -220,8 +226,7 @@ WORDS = {
         "[NAME=]SD",
         "standard deviation by observation, e.g. volume=1.0 displacement=0.2, mL and mm; a bare "
         "number is a single observation's or the displacements' (default 0.2 mm, 1 mL, less for a "
-        "small body). Other noise by its name, e.g. displacement=student_t:dof=4,scale=0.2 or "
-        "displacement=correlated:length=15,sd=0.1,spatial_sd=0.2 (length in mm)",
+        "small body). Other noise as displacement=KIND:OPTIONS, {noises}",
         read=noise_words,
     ),
     "noise_scale": Word(

@@ -11,7 +11,10 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
 
+import numpy as np
+
 from calibrate.measurements.collection import (
+    PRESENT,
     Observations,
     leave_out_missing,
     missing_values,
@@ -33,7 +36,7 @@ from calibrate.measurements.observation import Observation, Scalar
 from calibrate.measurements.parameter import MeasuredParameter
 from calibrate.measurements.points import DISPLACEMENT
 from calibrate.measurements.reaction import Reaction
-from calibrate.measurements.strain import SegmentStrain, Strain, segment_strains, strains
+from calibrate.measurements.strain import PointStrain, SegmentStrain, segment_strains, strains
 from calibrate.measurements.stress import Stress, stresses
 from calibrate.measurements.stretch import Stretch, stretches
 from calibrate.measurements.surface import (
@@ -46,6 +49,7 @@ from calibrate.measurements.surface import (
 )
 from calibrate.measurements.tube import TubeForce, TubePressure
 from calibrate.measurements.volume import CavityVolume
+from calibrate.measurements.words import from_json, parse
 from calibrate.state_names import in_state, split
 from emulator.core.errors import InputError, look_up
 from emulator.scenes.scene import Scene
@@ -56,7 +60,7 @@ OBSERVATIONS: dict[str, type[Observation]] = {
     for kind in (
         NodalDisplacements,
         Landmarks,
-        Strain,
+        PointStrain,
         SegmentStrain,
         SurfacePoints,
         RigidMarkers,
@@ -135,7 +139,7 @@ def parse_observation(
 def _parse_word(scene: Scene, word: str, seed: int) -> tuple[str, Observation]:
     """Return name and observation; a word's part before the colon is its kind, else it is nodes."""
     if kind := OBSERVATIONS.get(word.partition(":")[0]):
-        return kind.parse(scene, word, seed)
+        return parse(kind, scene, word, seed)
     if nodes := nodes_called(scene, word):
         return DISPLACEMENT, nodes
     raise InputError(
@@ -151,7 +155,12 @@ def observations_from_json(
 
     @cache
     def made(text: str) -> Observation:
-        each = json.loads(text)
-        return look_up(OBSERVATIONS, each.get("kind"), "observation kind").from_json(scene, each)
+        words = json.loads(text)
+        return from_json(look_up(OBSERVATIONS, words.get("kind"), "observation kind"), scene, words)
 
-    return Observations({name: made(json.dumps(each)) for name, each in description.items()})
+    parts, entries = dict[str, Observation](), dict[str, np.ndarray]()
+    for name, words in description.items():
+        parts[name] = made(json.dumps({key: words[key] for key in words if key != PRESENT}))
+        if PRESENT in words:
+            entries[name] = np.asarray(words[PRESENT])
+    return Observations(parts, entries)

@@ -1,9 +1,15 @@
-"""Observations of one body by name, in one load state or in several, and their missing values."""
+"""Observations of one body by name, in one load state or in several, and their missing values.
+
+Leaving a missing entry out is exact. With entries m missing and p present, the likelihood of what
+was measured is the integral of p(y_p, y_m | theta) over y_m, which for independent noise drops the
+factors of y_m, and for correlated Gaussian noise the rows and columns of its covariance. This
+supposes that whether a value is missing does not depend on the value.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from types import MappingProxyType
@@ -14,12 +20,17 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.sparse import csr_array, eye_array, vstack
 
-from calibrate.measurements.observation import Observation
+from calibrate.measurements.observation import Observation, check_values
+from calibrate.measurements.points import PointObservation
+from calibrate.measurements.words import names_of, to_json
+from calibrate.noise.protocol import Sites
 from calibrate.state_names import split, states_of
 from emulator.core.errors import InputError
 from emulator.surrogates.protocol import ForwardMap, Prediction
 
 Data = dict[str, jax.Array]
+PRESENT = "present"
+"""The key in JSON of the entries that are not missing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,9 +40,12 @@ class Observations:
     parts : the observations by name; those with one description become one object. In a body with
         several load states each name says which one is meant, as in ``volume@diastole``
         (:mod:`calibrate.statistical_model.load_states`).
+    entries : of each part with missing values the positions (n,) in its raveled data that are not
+        missing, ascending. Its data has shape (n,).
     """
 
     parts: Mapping[str, Observation]
+    entries: Mapping[str, np.ndarray] = MappingProxyType({})
 
     def __post_init__(self) -> None:
         if not self.parts:
@@ -40,7 +54,7 @@ class Observations:
             if not isinstance(name, str) or not name or "/" in name:
                 raise InputError(f"observation is called {name!r}; use a name without '/'")
         distinct: dict[str, Observation] = {}
-        parts = {n: distinct.setdefault(json.dumps(p.to_json()), p) for n, p in self.parts.items()}
+        parts = {n: distinct.setdefault(json.dumps(to_json(p)), p) for n, p in self.parts.items()}
         object.__setattr__(self, "parts", MappingProxyType(parts))
         self.states  # noqa: B018 - names that contradict each other are refused here
 
@@ -79,7 +93,47 @@ class Observations:
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape of each part's data."""
-        return {name: part.shape for name, part in self.parts.items()}
+        return {
+            name: self.entries[name].shape if name in self.entries else part.shape
+            for name, part in self.parts.items()
+        }
+
+    def only(self, names: Iterable[str]) -> Observations | None:
+        """Return the observations of these names; None where there is none."""
+        parts = {name: self.parts[name] for name in names}
+        entries = {name: e for name, e in self.entries.items() if name in parts}
+        return Observations(parts, entries) if parts else None
+
+    def sites(self, name: str) -> Sites | None:
+        """Return the position of each number of the data; None for what has no one position."""
+        part = self.parts[name]
+        if not isinstance(part, PointObservation):
+            return None
+        kept = self.entries.get(name, slice(None))
+        return Sites(*(of[kept] for of in Sites.of(part.points, max(len(part.components), 1))))
+
+    def filled(self, name: str, values: np.ndarray) -> np.ndarray:
+        """Return ``values`` of the data called ``name`` with the missing ones, which are NaN."""
+        if name not in self.entries:
+            return np.asarray(values)
+        filled = np.full(self.parts[name].shape, np.nan)
+        filled.flat[self.entries[name]] = values
+        return filled
+
+    def check(self, name: str, values: np.ndarray) -> None:
+        """Raise :class:`InputError` on data of a wrong shape or with impossible values.
+
+        NaN marks a missing value and passes.
+        """
+        part, shape = self.parts[name], self.shapes[name]
+        if values.shape != shape:
+            missing = missing_values(self).get(name)
+            gaps = f", as {missing} values are missing" if missing else ""
+            raise InputError(
+                f"data has shape {values.shape}; the observation expects {shape}{gaps} "
+                f"({name}, {part.unit})"
+            )
+        check_values(part, name, self.filled(name, values))
 
     def __call__(self, displacement: jax.Array, thetas: jax.Array) -> dict[str, jax.Array]:
         """Return the data of each part without noise.
@@ -103,34 +157,37 @@ class Observations:
             values = part(displacement[..., index, :, :][..., rows, :], thetas[..., index, :])
             by_state = jnp.moveaxis(values, values.ndim - 1 - len(part.shape), 0)
             data |= dict(zip(names, by_state, strict=True))
-        return {name: data[name] for name in self.parts}
+        return {name: self._present(name, data[name]) for name in self.parts}
+
+    def _present(self, name: str, values: jax.Array) -> jax.Array:
+        """Return the entries of data (..., *shape) without gaps that are not missing."""
+        if name not in self.entries:
+            return values
+        batch = values.shape[: values.ndim - len(self.parts[name].shape)]
+        return values.reshape(*batch, -1)[..., self.entries[name]]
 
     @cached_property
     def decoding(self) -> Decoding:
         """The matrix by which a sum of modes is decoded at once, in place of all nodes."""
-        wholes, groups = dict[str, Observation](), dict[str, list[str]]()
+        groups = dict[Observation, list[str]]()
         for name, part in self.parts.items():
-            whole = part.restricted(None)
-            key = json.dumps(whole.to_json())
-            wholes.setdefault(key, whole)
-            groups.setdefault(key, []).append(name)
+            groups.setdefault(part, []).append(name)
         columns = np.arange(3 * len(self.nodes)).reshape(-1, 3)
-        blocks, rows, others = list[csr_array](), dict[str, np.ndarray](), dict[str, Observation]()
+        blocks, rows, others = list[csr_array](), dict[str, np.ndarray](), list[str]()
         start = 0
-        for key, names in groups.items():
-            matrix = wholes[key].matrix
+        for part, names in groups.items():
+            matrix = part.matrix
             if matrix is None:
-                others |= {name: self.parts[name] for name in names}
+                others += names
                 continue
-            every = np.arange(matrix.shape[0])
-            own = {n: every if (e := self.parts[n].entries) is None else e for n in names}
-            used = np.unique(np.concatenate(list(own.values())))
+            entries = {n: self.entries.get(n, np.arange(matrix.shape[0])) for n in names}
+            used = np.unique(np.concatenate(list(entries.values())))
             block = csr_array(matrix)[used].tocoo()
             places = block.row, columns[self._rows[names[0]]].ravel()[block.col]
             blocks.append(csr_array((block.data, places), (len(used), columns.size)))
-            rows |= {n: start + np.searchsorted(used, entries) for n, entries in own.items()}
+            rows |= {n: start + np.searchsorted(used, e) for n, e in entries.items()}
             start += len(used)
-        rest = Observations(others) if others else None
+        rest = self.only(others)
         if rest is not None:
             place = {int(node): k for k, node in enumerate(self.nodes)}
             seen = columns[[place[int(node)] for node in rest.nodes]].ravel()
@@ -145,27 +202,26 @@ class Observations:
         forward : the map of all nodes.
         """
         with jax.ensure_compile_time_eval():  # what is kept must not be traced, if a caller is
-            own: dict[Observation, Callable[[jax.Array], jax.Array]] = {}
+            by_map: dict[Observation, Callable[[jax.Array], jax.Array]] = {}
             for part in dict.fromkeys(self.parts.values()):
-                if (told := part.through(forward)) is not None:
-                    own[part] = told
-            rest = {name: part for name, part in self.parts.items() if part not in own}
-            others = Observations(rest) if rest else None
+                if (function := part.through(forward)) is not None:
+                    by_map[part] = function
+            others = self.only(name for name, part in self.parts.items() if part not in by_map)
             seen = others._seen(forward.at(others.nodes)) if others is not None else None
-        if seen is not None and not own:
+        if seen is not None and not by_map:
             return seen
         states = () if others is None else others.states
         rows = np.array([self.states.index(state) for state in states], dtype=int)
 
         def data(thetas: jax.Array) -> tuple[Data, jax.Array]:
-            found, valid = ({}, jnp.array(True)) if seen is None else seen(thetas[rows])
-            for part, told in own.items():
-                names = [name for name, each in self.parts.items() if each is part]
-                own_rows = np.array([self.states.index(split(name)[1]) for name in names])
-                valid &= jnp.all(forward.scene.space.contains(thetas[own_rows]))
-                values = jax.vmap(told)(thetas[own_rows])
-                found |= dict(zip(names, jnp.where(valid, values, 0.0), strict=True))
-            return {name: found[name] for name in self.parts}, valid
+            values, valid = ({}, jnp.array(True)) if seen is None else seen(thetas[rows])
+            for part, function in by_map.items():
+                names = [name for name in self.parts if self.parts[name] is part]
+                at = thetas[np.array([self.states.index(split(name)[1]) for name in names])]
+                valid &= jnp.all(forward.scene.space.contains(at))
+                numbers = jnp.where(valid, jax.vmap(function)(at), 0.0)
+                values |= dict(zip(names, numbers, strict=True))
+            return {name: values[name] for name in self.parts}, valid
 
         return data
 
@@ -193,20 +249,17 @@ class Observations:
         values = jnp.where(valid, values, 0.0)
         _, rows, rest = self.decoding
         data: dict[str, jax.Array] = {}
-        for name, own in rows.items():
-            state, first = self.states.index(split(name)[1]), int(own[0])
-            in_a_row = np.array_equal(own, np.arange(first, first + len(own)))
-            taken = values[state, first : first + len(own)] if in_a_row else values[state, own]
-            data[name] = taken.reshape(self.parts[name].shape)
+        for name, index in rows.items():
+            state, first = self.states.index(split(name)[1]), int(index[0])
+            stop = first + len(index)
+            in_a_row = np.array_equal(index, np.arange(first, stop))
+            numbers = values[state, first:stop] if in_a_row else values[state, index]
+            data[name] = numbers.reshape(self.shapes[name])
         if rest is not None:
             states = np.array([self.states.index(state) for state in rest.states])
             u = values[states, values.shape[1] - 3 * len(rest.nodes) :]
             data |= rest(u.reshape(len(states), -1, 3), thetas[states])
         return {name: data[name] for name in self.parts}, valid
-
-    def gripped(self, shares: np.ndarray) -> Observations:
-        """Return the same observations of a gripped specimen, see :meth:`Observation.gripped`."""
-        return replace(self, parts={n: part.gripped(shares) for n, part in self.parts.items()})
 
     def expand[T](self, values: Mapping[str, T], what: str) -> dict[str, tuple[str, T]]:
         """Return values by the parts' names, from values by name, with or without its load state.
@@ -242,8 +295,9 @@ class Observations:
         return {name: values[name] for name in self.parts}
 
     def to_json(self) -> dict[str, Any]:
-        """Return the description of each part, by name."""
-        return {name: part.to_json() for name, part in self.parts.items()}
+        """Return the description of each part, and which entries are not missing, by name."""
+        present = {name: {PRESENT: entries.tolist()} for name, entries in self.entries.items()}
+        return {name: to_json(part) | present.get(name, {}) for name, part in self.parts.items()}
 
 
 class Decoding(NamedTuple):
@@ -273,7 +327,9 @@ def observations(observe: Observation | Mapping[str, Observation] | Observations
     """Return observations by name; a single one without a name gets its usual name."""
     if isinstance(observe, Observations):
         return observe
-    return Observations(observe if isinstance(observe, Mapping) else {observe.names[0]: observe})
+    return Observations(
+        observe if isinstance(observe, Mapping) else {names_of(observe)[0]: observe}
+    )
 
 
 def leave_out_missing(
@@ -283,15 +339,15 @@ def leave_out_missing(
 
     :class:`InputError` for an observation of which every value is missing.
     """
-    parts, present = dict(observe.parts), dict(data)
+    entries, present = dict(observe.entries), dict(data)
     for name, values in data.items():
         check_some(name, values)
         rows = np.flatnonzero(~np.isnan(values))
         if len(rows) < np.size(values):
-            entries = parts[name].entries
-            parts[name] = parts[name].restricted(rows if entries is None else entries[rows])
+            entries[name] = entries[name][rows] if name in entries else rows
             present[name] = np.ravel(values)[rows]
-    return replace(observe, parts=parts), present
+    complete = all(present[name] is values for name, values in data.items())
+    return (observe if complete else replace(observe, entries=entries)), present
 
 
 def check_some(name: str, values: np.ndarray) -> None:
@@ -302,4 +358,7 @@ def check_some(name: str, values: np.ndarray) -> None:
 
 def missing_values(observe: Observations) -> dict[str, int]:
     """Return the number of missing values by the observation's name, where there are any."""
-    return {name: part.missing for name, part in observe.parts.items() if part.missing}
+    return {
+        name: int(np.prod(observe.parts[name].shape)) - len(entries)
+        for name, entries in observe.entries.items()
+    }

@@ -30,7 +30,14 @@ import numpy as np
 
 from calibrate.measurements import OBSERVATIONS
 from calibrate.measurements.collection import Observations, check_some, observations
-from calibrate.measurements.observation import Block, Field, Observation, Table
+from calibrate.measurements.observation import (
+    Block,
+    DataField,
+    Layout,
+    Observation,
+    check_values,
+)
+from calibrate.measurements.points import PointObservation
 from calibrate.measurements.specimens import check_tests
 from calibrate.measurements.tables import (
     KNOWN,
@@ -40,6 +47,7 @@ from calibrate.measurements.tables import (
     write_csv,
     write_netcdf,
 )
+from calibrate.measurements.words import names_of, parse
 from calibrate.state_names import in_state, split
 from emulator.core.cells import SPREADSHEETS, TEXT
 from emulator.core.errors import InputError
@@ -71,9 +79,9 @@ def read_measurements(
     data: dict[str, np.ndarray] = {}
     known: dict[str, float] = {}
     paths: Mapping[str, str | Path] = files if isinstance(files, Mapping) else {"": files}
-    for given, path in paths.items():
-        if paths is files and (not given or set("@/+") & set(given)):
-            raise InputError(f"data: load state '{given}'; give it a name without @, / and +")
+    for prefix, path in paths.items():
+        if paths is files and (not prefix or set("@/+") & set(prefix)):
+            raise InputError(f"data: load state '{prefix}'; give it a name without @, / and +")
         file = Path(path)
         if not file.is_file():
             raise InputError(f"data file {path} does not exist")
@@ -81,8 +89,8 @@ def read_measurements(
             raise InputError(f"data file {path} is a spreadsheet; save it as CSV")
         of_cells = file.suffix.lower() in (*TEXT, *SPREADSHEETS)
         read: Reader = read_csv if of_cells else read_netcdf
-        for own, table in read(file).items():
-            state = ".".join(filter(None, (given, own)))
+        for inner, table in read(file).items():
+            state = ".".join(filter(None, (prefix, inner)))
             known |= {in_state(name, state): value for name, value in table.known.items()}
             for name, (part, values) in _observed(scene, table, state).items():
                 parts[name], data[name] = part, values
@@ -93,42 +101,58 @@ def _observed(
     scene: Scene, file: DataTable, state: str
 ) -> dict[str, tuple[Observation, np.ndarray]]:
     """Return the observations of one load state and their data, by name."""
-    tables, found = _tables(file), {}
-    for base, (kind, table) in tables.items():
-        name, places = in_state(base, state), _words(table, where=True)
-        sharing = [t for _, t in tables.values() if places & _words(t, where=True)]
-        others = {w for t in sharing if t is not table for w in _words(t, where=False)}
-        arrays = file.arrays(table.fields, others)
+    layouts, observed = _layouts(file), {}
+    for base, (kind, layout) in layouts.items():
+        name, places = in_state(base, state), _words(layout, where=True)
+        sharing = [other for _, other in layouts.values() if places & _words(other, where=True)]
+        others = {w for o in sharing if o is not layout for w in _words(o, where=False)}
+        arrays = file.arrays(layout.fields, others)
         try:
-            part, values = found[name] = kind.read(scene, base, table, arrays)
-            part.check(name, values)
+            part, values = observed[name] = _read(kind, scene, base, layout, arrays)
+            check_values(part, name, values)
             check_some(base, values)
         except InputError as error:
             where = f", state '{state}'" if state else ""
             raise InputError(f"data file {file.path}{where}: {error}") from error
     try:
-        check_tests(found)
+        check_tests(observed)
     except InputError as error:
         raise InputError(f"data file {file.path}: {error}") from error
-    return found
+    return observed
 
 
-def _words(table: Table, *, where: bool) -> set[str]:
-    return {word for field in table.fields if field.where is where for word in field.columns}
+def _read(
+    kind: type[Observation],
+    scene: Scene,
+    name: str,
+    layout: Layout,
+    arrays: Mapping[str, np.ndarray],
+) -> tuple[Observation, np.ndarray]:
+    """Return the observation called ``name`` and its data, from the arrays of its layout."""
+    if issubclass(kind, PointObservation):
+        return kind.read(scene, layout, arrays)
+    part, number = parse(kind, scene, name)[1], arrays[name]
+    if number.size != 1:
+        raise InputError(f"{name} has {number.size} values; give one, in {part.unit}")
+    return part, number.reshape(())
 
 
-def _tables(file: DataTable) -> dict[str, tuple[type[Observation], Table]]:
-    """Return kind and table of each observation that the file has all columns of, by name."""
-    complete: dict[str, tuple[type[Observation], Table]] = {}
+def _words(layout: Layout, *, where: bool) -> set[str]:
+    return {word for field in layout.fields if field.where is where for word in field.columns}
+
+
+def _layouts(file: DataTable) -> dict[str, tuple[type[Observation], Layout]]:
+    """Return kind and layout of each observation that the file has all columns of, by name."""
+    complete: dict[str, tuple[type[Observation], Layout]] = {}
     partial: list[list[str]] = []
     used: set[str] = set()
     for kind in OBSERVATIONS.values():
-        for name, table in kind.tables(file.words).items():
-            words = [word for field in table.fields for word in file.words_of(field)]
+        for name, layout in kind.layouts(file.words).items():
+            words = file.words_of(layout)
             if not set(words) <= set(file.words):
                 partial.append(words)
             elif name not in complete:
-                complete[name] = kind, table
+                complete[name] = kind, layout
                 used.update(words)
     # An incomplete observation is refused; otherwise its columns would be silently ignored.
     partial = [words for words in partial if set(words) & set(file.words) - used]
@@ -137,9 +161,9 @@ def _tables(file: DataTable) -> dict[str, tuple[type[Observation], Table]]:
     lacking = [[w for w in words if w not in file.words] for words in partial]
     fault = f"{file.what} '{min(lacking, key=len)[0]}' is missing" if partial else "no data"
     every = " or ".join(
-        ",".join(word for field in table.fields for word in file.words_of(field))
+        ",".join(file.words_of(layout))
         for name, kind in OBSERVATIONS.items()
-        for table in kind.tables((name,)).values()
+        for layout in kind.layouts((name,)).values()
     )
     raise InputError(f"data file {file.path}: {fault}; expected {file.what}s {every}")
 
@@ -166,14 +190,33 @@ def write_data(
     states: dict[str, list[Block]] = {state: [] for state in observe.states}
     for name, part in observe.parts.items():
         base, state = split(name)
-        if _by_value(base) not in map(_by_value, part.names):
+        if _by_value(base) not in map(_by_value, names_of(part)):
             raise InputError(
                 f"observation '{name}' does not fit in a data file; "
-                f"there it would be called {' or '.join(part.names)}"
+                f"there it would be called {' or '.join(names_of(part))}"
             )
-        states[state].append(part.block(base, part.filled(np.asarray(data[name]))))
+        states[state].append(_block(part, base, observe.filled(name, np.asarray(data[name]))))
     for name, value in known.items():
         base, state = split(name)
-        states[state].append([(Field(KNOWN + base, (KNOWN + base,)), np.asarray(value))])
+        states[state].append([(DataField(KNOWN + base, (KNOWN + base,)), np.asarray(value))])
     write = write_netcdf if Path(path).suffix.lower() == ".nc" else write_csv
     write(path, states)
+
+
+def _block(part: Observation, name: str, values: np.ndarray) -> Block:
+    """Return the arrays that hold ``values`` in a data file, NaN where they are missing.
+
+    A column of a free stretch says where in the states in which it is prescribed.
+    """
+    if not isinstance(part, PointObservation):
+        return [(DataField(name, (name,)), values)]
+    block = {field.variable: (field, array) for field, array in part.place_block}
+    columns = iter(values.reshape(len(values), -1).T)
+    for field in part.values_in(*part.selection):
+        array = np.stack([next(columns) for _ in field.columns], axis=-1)
+        array = array[:, 0] if len(field.columns) == 1 else array
+        if field.variable in block:
+            place = block[field.variable][1]
+            array = np.where(np.isnan(place), array, place)
+        block[field.variable] = field, array
+    return list(block.values())

@@ -11,6 +11,7 @@ functions), or the mean of a node set, to which each node counts the same.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -20,8 +21,9 @@ import numpy as np
 from scipy.sparse import csr_array, eye_array, kron
 
 from calibrate.measurements.location import locate
-from calibrate.measurements.observation import LENGTH_UNITS, Field, Scalar
+from calibrate.measurements.observation import DataField, Layout, Scalar
 from calibrate.measurements.points import XYZ, DisplacementPoints, as_points, gather
+from calibrate.measurements.words import names_of
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import shapes_at
 from emulator.scenes.scene import Scene, all_nodes, check_nodes
@@ -59,8 +61,8 @@ class NodalDisplacements(DisplacementPoints):
 
     kind = "nodes"
     usage = "nodes:N, all, a node set, node numbers like 3,14,15"
-    arguments = ("nodes",)
-    place_field = Field("node", ("node",), where=True)
+    place = "nodes"
+    place_field = DataField("node", ("node",), where=True)
     spread = staticmethod(spread_nodes)
 
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
@@ -127,8 +129,7 @@ class Landmarks(DisplacementPoints):
 
     kind = "landmarks"
     usage = "landmarks:N"
-    arguments = ("points",)
-    place_field = Field("position", XYZ, where=True)
+    place_field = DataField("position", XYZ, where=True)
     spread = staticmethod(spread_landmarks)
 
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
@@ -159,14 +160,14 @@ class Landmarks(DisplacementPoints):
         return cls(nodes, points, members, shapes_at(scene.mesh.order, inside)[0])
 
     @classmethod
-    def located(
-        cls, scene: Scene, selection: tuple[Any, ...], places: np.ndarray, values: np.ndarray
-    ) -> Self:
-        """Return the observation at the positions of a file, which must be those at rest."""
+    def read(
+        cls, scene: Scene, layout: Layout, arrays: Mapping[str, np.ndarray]
+    ) -> tuple[Self, np.ndarray]:
+        """Return the observation and its data; positions must be those at rest."""
         try:
-            return cls.of(scene, places)
+            return super().read(scene, layout, arrays)
         except InputError as error:
-            if _are_deformed(scene, places, values):
+            if _are_deformed(scene, *(arrays[field.variable] for field in layout.fields)):
                 raise InputError(
                     f"{error}; less their displacements all points lie inside: give positions at "
                     "rest"
@@ -176,6 +177,8 @@ class Landmarks(DisplacementPoints):
 
 def _are_deformed(scene: Scene, points: np.ndarray, values: np.ndarray) -> bool:
     """Return whether points (d, 3) lie in the body only once displacements are subtracted."""
+    if points.shape != values.shape or points.shape[1:] != (3,):
+        return False
     measured = np.isfinite(values).all(axis=1)
     try:
         locate(scene.mesh, points[measured] - values[measured])
@@ -204,7 +207,6 @@ class Length(Scalar):
     usage = "length:A:B (each a node, a node set or x,y,z)"
     quantity = "length"
     unit = "mm"
-    other_units = LENGTH_UNITS
     usual_sd = 0.5
     arguments = ("first", "second")
 
@@ -235,7 +237,7 @@ class Length(Scalar):
         part = cls(first, second, nodes, weights, ends)
         if not np.linalg.norm(ends[1] - ends[0]) > _SHORTEST * scene.mesh.size:
             raise InputError(
-                f"observe '{part.names[0]}': both landmarks are at {ends[0].tolist()} mm"
+                f"observe '{names_of(part)[0]}': both landmarks are at {ends[0].tolist()} mm"
             )
         return part
 

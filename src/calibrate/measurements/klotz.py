@@ -38,10 +38,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from calibrate.measurements.observation import Scalar
+from calibrate.measurements.observation import Scalar, derive
 from calibrate.measurements.volume import CavityVolume
+from calibrate.measurements.words import names_of
 from emulator.core.errors import InputError
-from emulator.scenes.loads import KPA_PER_MMHG
+from emulator.core.units import KPA_PER_MMHG
 from emulator.scenes.scene import Scene, inflated_cavity
 
 PRESSURE_SCATTER = 3.0 * KPA_PER_MMHG
@@ -157,20 +158,19 @@ class KlotzVolume(Scalar):
     hint = ", such as klotz:1.3"
     quantity = "volume"
     unit = CavityVolume.unit
-    other_units = CavityVolume.other_units
     arguments = ("measured_pressure",)
 
     def __post_init__(self) -> None:
-        _check_pressure(self.names[0], self.measured_pressure)
+        _check_pressure(names_of(self)[0], self.measured_pressure)
         inflated = inflated_cavity(self.scene)
         if inflated is None:
             raise InputError(
-                f"{self.names[0]}: scene '{self.scene.name}' has no cavity whose pressure is a "
+                f"{names_of(self)[0]}: scene '{self.scene.name}' has no cavity whose pressure is a "
                 f"parameter; it has {', '.join(self.scene.parameter_names)}"
             )
         volume = CavityVolume(self.scene, inflated[0])
         column = self.scene.parameter_names.index(inflated[1])
-        self._derive(volume=volume, column=column, nodes=volume.nodes)
+        derive(self, volume=volume, column=column, nodes=volume.nodes)
 
     @classmethod
     def of(cls, scene: Scene, pressure: str) -> Self:

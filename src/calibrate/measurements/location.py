@@ -15,8 +15,8 @@ from __future__ import annotations
 import numpy as np
 from skfem import MeshTet
 
-from calibrate.measurements.observation import LENGTH_UNITS
 from emulator.core.errors import InputError
+from emulator.core.units import other_units
 from emulator.geometry.discretisation import shapes_at
 from emulator.geometry.mesh import Mesh
 
@@ -71,7 +71,8 @@ def _check_extent(mesh: Mesh, points: np.ndarray) -> None:
     if span == 0.0 or _LEAST * body <= span <= _MOST * body:
         return
     # The unit in which the points' span would be closest to the body's size.
-    unit, factor = min(LENGTH_UNITS.items(), key=lambda item: abs(np.log(item[1] * span / body)))
+    lengths = other_units("mm").items()
+    unit, factor = min(lengths, key=lambda item: abs(np.log(item[1] * span / body)))
     raise InputError(
         f"{len(points)} points span {span:.3g} mm, the body {body:.3g} mm: {unit} instead of mm? "
         f"multiply their coordinates by {factor:g}"

@@ -31,6 +31,7 @@ from calibrate.measurements.collection import Observations
 from calibrate.measurements.observation import Observation
 from emulator.core.errors import InputError
 from emulator.core.minimise import minimise
+from emulator.core.units import other_units
 
 _DRAWS = 32  # predictions at draws of the prior
 PRIOR_DRAWS = 4096  # draws whose extremes approximate the ends of a parameter's prior
@@ -159,7 +160,7 @@ def _guess(part: Observation, size: float, norms: np.ndarray, ratio: float) -> s
     """Return the unit that would bring the data to the size of the predictions."""
     fitting = {
         unit: factor
-        for unit, factor in part.other_units.items()
+        for unit, factor in other_units(part.unit).items()
         if norms.min() / _FACTOR < factor * size < norms.max() * _FACTOR
     }
     if not fitting:

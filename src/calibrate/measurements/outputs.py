@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import cached_property
 from itertools import pairwise
 from typing import Any
@@ -12,9 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibrate.measurements import (
-    Observation,
     Observations,
-    observations,
     observations_from_json,
     parse_observation,
 )
@@ -35,7 +33,7 @@ class Outputs:
     Programs are compiled once.
 
     forward : the forward map.
-    parts : the observations, by name.
+    observe : the observations; None for none.
     field : whether to observe every node's displacement, too.
     what : the beginning of the line of a refusal.
 
@@ -48,12 +46,11 @@ class Outputs:
     def __init__(
         self,
         forward: ForwardMap,
-        parts: Mapping[str, Observation],
+        observe: Observations | None,
         *,
         field: bool = False,
         what: str = "prediction",
     ) -> None:
-        observe = observations(parts) if parts else None
         nodes = forward.nodes if field or observe is None else observe.nodes
         self.nodes, self._map = nodes, forward.at(nodes)
         self._observe, self._field, self._what = observe, field, what
@@ -62,7 +59,8 @@ class Outputs:
         position = {int(node): k for k, node in enumerate(nodes)}
         seen = () if observe is None else observe.nodes.tolist()
         self._rows = np.array([position[node] for node in seen], dtype=int)
-        sizes = {name: int(np.prod(part.shape)) for name, part in parts.items()}
+        shapes = {} if observe is None else observe.shapes
+        sizes = {name: int(np.prod(shape)) for name, shape in shapes.items()}
         sizes |= {FIELD: len(nodes)} if field else {}
         ends = np.cumsum([0, *sizes.values()])
         self.places = {
@@ -77,7 +75,7 @@ class Outputs:
                 seen = self._observe(u[None, self._rows], theta[None])
             else:
                 seen, _ = self._through(theta[None])
-            numbers += [jnp.ravel(each) for each in seen.values()]
+            numbers += [jnp.ravel(values) for values in seen.values()]
         if self._field:
             square = jnp.sum(u**2, axis=-1)
             # The derivative of a length is not defined where the displacement is 0.

@@ -7,12 +7,9 @@ from dataclasses import dataclass
 import jax
 import numpy as np
 
-from calibrate.measurements.observation import Scalar
+from calibrate.measurements.observation import Scalar, derive
 from emulator.core.errors import InputError
-from emulator.scenes.loads import KPA_PER_MMHG
 from emulator.scenes.scene import Scene
-
-_OTHER_UNITS = {"kPa": {"mmHg": KPA_PER_MMHG, "Pa": 1e-3, "MPa": 1e3}}
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,15 +41,14 @@ class MeasuredParameter(Scalar):
             )
         unit = self.scene.quantities[self.parameter].unit or "1"
         # No displacement is needed, but forward maps predict one node or more.
-        self._derive(unit=unit, other_units=_OTHER_UNITS.get(unit, {}), nodes=np.zeros(1, int))
+        derive(self, unit=unit, nodes=np.zeros(1, int))
 
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the entry (...) of ``theta``."""
         return theta[..., self.scene.parameter_names.index(self.parameter)]
 
-    def check_values(self, name: str, values: np.ndarray) -> None:
-        """Refuse a number that the parameter cannot have."""
-        super().check_values(name, values)
-        fault = self.scene.quantities[self.parameter].value_fault(float(values))
-        if fault and not np.isnan(values):
-            raise InputError(f"data: {fault}")
+    def fault(self, name: str, values: np.ndarray) -> str | None:
+        """Return a sentence on a number that the parameter cannot have."""
+        if np.isnan(values):
+            return None
+        return self.scene.quantities[self.parameter].value_fault(float(values))

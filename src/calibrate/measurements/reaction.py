@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 
 import jax
 
-from calibrate.measurements.observation import Scalar
+from calibrate.measurements.observation import Scalar, derive
 from emulator.core.errors import InputError
+from emulator.core.units import IN_MN
 from emulator.fem.reactions import SupportForce
-from emulator.scenes.loads.force import MN_PER_N
 from emulator.scenes.scene import Scene
 from emulator.surrogates.protocol import ForwardMap
 
@@ -42,23 +42,22 @@ class Reaction(Scalar):
     hint = ", such as reaction:top:x"
     quantity = "force"
     unit = "N"
-    other_units = {"mN": 1e-3, "gf": 9.80665e-3, "kN": 1e3}
     arguments = ("support", "direction")
     positive = False
 
     def __post_init__(self) -> None:
         force = SupportForce(self.scene, self.support, _direction(self.direction))
-        self._derive(force=force, nodes=force.nodes)
+        derive(self, force=force, nodes=force.nodes)
 
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the force (...) in N."""
-        return self.force(displacement, theta) / MN_PER_N
+        return self.force(displacement, theta) / IN_MN["N"]
 
     def through(self, forward: ForwardMap) -> Callable[[jax.Array], jax.Array] | None:
         """Return the force () in N by the work of the whole body, of an emulator of the scene."""
         by_work = getattr(forward, "support_force", None)
         force = None if by_work is None else by_work(self.force)
-        return None if force is None else lambda theta: force(theta) / MN_PER_N
+        return None if force is None else lambda theta: force(theta) / IN_MN["N"]
 
 
 def _direction(text: str) -> tuple[float, float, float]:

@@ -5,22 +5,22 @@ from __future__ import annotations
 import re
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from functools import cached_property
+from dataclasses import replace
 from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibrate.measurements.observation import Block, Field
+from calibrate.measurements.collection import Observations
+from calibrate.measurements.observation import Block, DataField, Observation, derive
 from calibrate.measurements.points import PointObservation
-from calibrate.noise.protocol import Sites
 from emulator.core.errors import InputError
 from emulator.scenes.scene import Scene, all_nodes
 from emulator.scenes.specimen import measured_states, states_in
 from emulator.scenes.states import APPLIED, AXES, States
 
-_APART = 1e3  # distance between the sites of two tests, whose errors do not correlate
+_APART = 1e3  # distance between the points of two tests, whose errors do not correlate
 _ROUND_OFF = 1e-6
 _FEWEST_ALIKE, _DIGITS_ALIKE = 3, 9  # rows, and decimals, in which two tests are the same one
 
@@ -28,89 +28,75 @@ _FEWEST_ALIKE, _DIGITS_ALIKE = 3, 9  # rows, and decimals, in which two tests ar
 class SpecimenCurves(PointObservation):
     """Numbers (d, c), or (d,) without components, measured in the d states of a specimen.
 
-    A kind computes them from all nodes in ``_measured``, and gives its columns.
+    A kind computes them from all nodes in ``_measured``, and gives its columns. It declares
+
+    curve_axis : the label of the x axis of :meth:`curves`.
+    at_rest : the number that is measured at rest.
+    usual_length : the arc length of a curve over which errors correlate in a first experiment file,
+        and its unit.
+
+    and has
 
     scene : the specimen; :class:`InputError` for another scene.
+    states : the measured states.
+    points : the arc length of each state from the first of its test, and the test's position, so
+        that errors correlate along a curve.
+    stretches : the prescribed stretches of the states along x, y and z, (d, 3); NaN where free.
     """
 
     scene: Scene
+    states: States
+    stretches: np.ndarray
 
-    place_field = Field("motion", ("stretch_x",), where=True)
+    place = ""
+    row = "state"
     constants = {"stretch": "stretches"}
-    curve_axis = "way from the first state of each test, in stretch"
-    positive = False
+    curve_axis: ClassVar[str] = "way from the first state of each test, in stretch"
     at_rest: ClassVar[float] = 0.0
-    """The number that is measured at rest."""
     usual_length: ClassVar[tuple[float, str]] = (0.1, "of stretch")
-    """Way along a curve over which errors correlate in a first experiment file, and its unit."""
 
     def __post_init__(self) -> None:
-        measured_states(self.scene)  # refuses what is no specimen
-        self._derive(nodes=all_nodes(self.scene))
+        states = measured_states(self.scene)
+        points = np.zeros((len(states.free), 3))
+        points[:, 0] = states.paths
+        for number, rows in enumerate(states.protocols.values()):
+            points[rows, 1] = _APART * number
+        diagonals = np.diagonal(states.gradients, axis1=1, axis2=2)
+        stretches = np.where(states.free, np.nan, 1.0 + diagonals)
+        nodes = all_nodes(self.scene)
+        derive(self, nodes=nodes, states=states, points=points, stretches=stretches)
 
     @abstractmethod
     def _measured(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the numbers (d, c) at the displacement (n, 3) mm of all nodes."""
 
-    @cached_property
-    def states(self) -> States:
-        """The measured states."""
-        return measured_states(self.scene)
+    def tests(self, entries: np.ndarray | None = None) -> dict[str, np.ndarray]:
+        """Return the entries (k,) of the data of each test; one without a name where none has any.
 
-    @property
-    def _full_shape(self) -> tuple[int, ...]:
-        count = len(self.states.free)
-        return (count, len(self.components)) if self.components else (count,)
+        entries : the entries of the raveled data that are not missing, where some are.
+        """
+        states, _ = self._states_and_components(entries)
+        tests = self.states.protocols
+        return {test: np.flatnonzero(np.isin(states, rows)) for test, rows in tests.items()}
 
-    @cached_property
-    def stretches(self) -> np.ndarray:
-        """The prescribed stretches of the states along x, y and z, (d, 3); NaN where free."""
-        diagonals = np.diagonal(self.states.gradients, axis1=1, axis2=2)
-        return np.where(self.states.free, np.nan, 1.0 + diagonals)
+    def curves(self, entries: np.ndarray | None = None) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Return the curve of each test and component: x (k,) and the entries (k,) of the data.
 
-    @property
-    def tests(self) -> Mapping[str, np.ndarray]:
-        """The states (k,) of each test by its name; one without a name where none has any."""
-        return self.states.protocols
+        entries : as of :meth:`tests`.
+        """
+        states, components = self._states_and_components(entries)
+        curves = {}
+        for test, rows in self.tests(entries).items():
+            for c, name in enumerate(self.components or (self.name,)):
+                points = rows[components[rows] == c]
+                if len(points):
+                    curves[f"{test} {name}".strip()] = self.points[states[points], 0], points
+        return curves
 
-    @cached_property
-    def paths(self) -> np.ndarray:
-        """The way of each state from the first of its test, and the test's place."""
-        paths = np.zeros((len(self.states.free), 3))
-        paths[:, 0] = self.states.paths
-        for number, rows in enumerate(self.tests.values()):
-            paths[rows, 1] = _APART * number
-        return paths
-
-    @property
-    def sites(self) -> Sites:
-        """The way along each test, so that errors correlate along its curve."""
-        sites = Sites.of(self.paths, max(len(self.components), 1))
-        return sites if self.entries is None else Sites(*(each[self.entries] for each in sites))
-
-    @property
-    def data_of_tests(self) -> Mapping[str, np.ndarray]:
-        """The entries (k,) of the data of each test."""
-        number = self.sites.positions[:, 1] / _APART
-        return {test: np.flatnonzero(number == k) for k, test in enumerate(self.tests)}
-
-    @property
-    def curves(self) -> Mapping[str, tuple[np.ndarray, np.ndarray]]:
-        """The curve of each test and component, over the way from its first state."""
-        names = self.components or (self.name,)
-        every = np.arange(len(self.paths) * len(names))
-        states, columns = np.divmod(every if self.entries is None else self.entries, len(names))
-        found = {}
-        for test, rows in self.tests.items():
-            for c, name in enumerate(names):
-                own = np.flatnonzero(np.isin(states, rows) & (columns == c))
-                if len(own):
-                    found[f"{test} {name}".strip()] = self.paths[states[own], 0], own
-        return found
-
-    def rows(self) -> tuple[str, np.ndarray]:
-        """Return the numbers of the states."""
-        return "state", np.arange(len(self.paths))
+    def _states_and_components(self, entries: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """Return the state and the component (n,) of each of the data."""
+        rows = np.arange(int(np.prod(self.shape))) if entries is None else entries
+        return np.divmod(rows, max(len(self.components), 1))
 
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the numbers (..., d, c), or (..., d) without components."""
@@ -120,19 +106,19 @@ class SpecimenCurves(PointObservation):
     def check_motion(self, columns: Mapping[str, np.ndarray]) -> Self:
         """Return the observation if a table's columns of motion are its own states."""
         scene, expected = self.scene, self.states
-        found = states_in(columns, tube=scene.tube, ordered=False)
-        each = 1 if scene.tube is None else scene.tube.size
-        if len(found.free) != each * len(expected.free):
+        in_table = states_in(columns, tube=scene.tube, ordered=False)
+        size = 1 if scene.tube is None else scene.tube.size
+        if len(in_table.free) != size * len(expected.free):
             raise InputError(
-                f"{len(found.free) // each} rows say how the specimen moves; scene '{scene.name}' "
-                f"has {len(expected.free)} states"
+                f"{len(in_table.free) // size} rows say how the specimen moves; scene "
+                f"'{scene.name}' has {len(expected.free)} states"
             )
-        apart = np.abs(found.gradients[::each] - expected.gradients).max(axis=(1, 2))
-        pulled = np.abs(found.pulls[::each] - expected.pulls).max(axis=1)
+        apart = np.abs(in_table.gradients[::size] - expected.gradients).max(axis=(1, 2))
+        pulled = np.abs(in_table.pulls[::size] - expected.pulls).max(axis=1)
         other = np.flatnonzero(
             (apart > _ROUND_OFF)
             | (pulled > _ROUND_OFF * np.abs(expected.pulls).max())
-            | (found.free[::each] != expected.free).any(axis=1)
+            | (in_table.free[::size] != expected.free).any(axis=1)
         )
         if len(other):
             raise InputError(
@@ -140,10 +126,11 @@ class SpecimenCurves(PointObservation):
             )
         return self
 
-    def motion(self, also: Sequence[str] = ()) -> Block:
-        """Return the columns of a data file that say how the specimen moves and is pulled.
+    @property
+    def place_block(self) -> Block:
+        """The columns of a data file that say how the specimen moves and is pulled.
 
-        also : columns that are there even if they say nothing, of zeros or NaN.
+        Columns of zeros or NaN are left out unless they are of a component's pull.
         """
         if self.scene.tube is not None:
             arrays = self.scene.tube.motion(self.stretches)
@@ -157,8 +144,13 @@ class SpecimenCurves(PointObservation):
             }
             pulls = np.where(self.states.free, self.states.pulls, np.nan)
             arrays |= {f"{APPLIED}_{a}": pulls[:, k] for k, a in enumerate(AXES)}
-        kept = {w: x for w, x in arrays.items() if w in also or np.nan_to_num(x).any()}
-        return [(Field(word, (word,)), x) for word, x in kept.items()]
+        kept = {w: x for w, x in arrays.items() if w in self._pulls or np.nan_to_num(x).any()}
+        return [(DataField(word, (word,), where=True), x) for word, x in kept.items()]
+
+    @property
+    def _pulls(self) -> Sequence[str]:
+        """The columns of prescribed stresses whose stretch is measured."""
+        return ()
 
 
 class Components(SpecimenCurves):
@@ -185,10 +177,31 @@ class Components(SpecimenCurves):
                 raise InputError(f"{self.quantity} '{component}' is unknown; {self.such_as}")
 
     @classmethod
+    def values_in(cls, *selection: Any) -> tuple[DataField, ...]:
+        """Return a field for each component."""
+        return tuple(DataField(component, (component,)) for component in selection[0])
+
+    @classmethod
     def of(cls, scene: Scene, components: str | Sequence[str]) -> Self:
         """Return the observation of ``components``, as text joined by commas."""
         texts = components.split(",") if isinstance(components, str) else components
         return cls(scene, tuple(str(text) for text in texts))  # type: ignore[call-arg]
+
+
+def gripped_observations(observe: Observations, shares: np.ndarray) -> Observations:
+    """Return the observations of a specimen with the stress that its grips add.
+
+    shares : the added stress of each state as a fraction of its homogeneous stress, (d, 3, 3).
+
+    :class:`InputError` for an observation without a method ``gripped``, to which they add nothing.
+    """
+    parts: dict[str, Observation] = {}
+    for name, part in observe.parts.items():
+        gripped = getattr(part, "gripped", None)
+        if gripped is None:
+            raise InputError(f"'{part.kind}' says nothing of a specimen's grips")
+        parts[name] = gripped(shares)
+    return replace(observe, parts=parts)
 
 
 def check_tests(observed: Mapping[str, tuple[Any, np.ndarray]]) -> None:
@@ -198,7 +211,7 @@ def check_tests(observed: Mapping[str, tuple[Any, np.ndarray]]) -> None:
     """
     curves = [(part, y) for part, y in observed.values() if isinstance(part, SpecimenCurves)]
     seen: dict[bytes, str] = {}
-    for test, rows in curves[0][0].tests.items() if curves else ():
+    for test, rows in curves[0][0].states.protocols.items() if curves else ():
         if len(rows) < _FEWEST_ALIKE:
             continue
         states = curves[0][0].states

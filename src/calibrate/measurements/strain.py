@@ -39,7 +39,7 @@ import numpy as np
 
 from calibrate.measurements.displacements import spread_landmarks
 from calibrate.measurements.location import gradients_at, locate
-from calibrate.measurements.observation import Block, Field, Table
+from calibrate.measurements.observation import DataField, Layout
 from calibrate.measurements.points import XYZ, PointObservation, as_points, gather
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import from_quadrature_points
@@ -62,9 +62,11 @@ COMPONENTS = {
 """Directions, with the name in files of the strain along each."""
 
 
+@dataclass(frozen=True, eq=False)
 class Strains(PointObservation):
     """Strains (d, c) of ``components`` (c) at d places, made of those at s samples.
 
+    points : the places in the reference body, mm, (d, 3).
     nodes : the nodes of the samples' elements, each once, (k,).
     members : positions in ``nodes`` of each sample's element, (s, a).
     slopes : derivatives of its shape functions along each direction, 1/mm, (s, c, a).
@@ -72,6 +74,9 @@ class Strains(PointObservation):
     prefix : comes before the components' names in files.
     """
 
+    components: tuple[str, ...]
+    points: np.ndarray
+    nodes: np.ndarray
     members: np.ndarray
     slopes: np.ndarray
     directions: np.ndarray
@@ -79,10 +84,9 @@ class Strains(PointObservation):
 
     quantity = "strain"
     unit = "1"
-    other_units = {"%": 0.01}
     usual_sd = 0.02
     hint = f"; components: {', '.join(COMPONENTS)}"
-    value_fields = ()  # one for each component
+    arguments = ("components",)
 
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
         """Return strains (..., s, c) of the samples."""
@@ -94,53 +98,37 @@ class Strains(PointObservation):
         return jnp.moveaxis(jnp.sum((directions + 0.5 * along) * along, axis=-2), -1, -2)
 
     @classmethod
-    def fields(cls, *selection: Any) -> tuple[Field, ...]:
-        """Return the places, and a column for each component, such as ``E_circ``."""
+    def values_in(cls, *selection: Any) -> tuple[DataField, ...]:
+        """Return a field for each component, such as ``E_circ``."""
         columns = (cls.prefix + COMPONENTS[name] for name in selection[0])
-        return (cls.place_field, *(Field(column, (column,)) for column in columns))
+        return tuple(DataField(column, (column,)) for column in columns)
 
     @classmethod
-    def tables(cls, words: Collection[str]) -> dict[str, Table]:
-        """Return the table of the components in columns, of one as an example if there are none."""
-        found = tuple(c for c, column in COMPONENTS.items() if cls.prefix + column in words)
-        components = found or ("circumferential",)
-        return {cls.name: Table((components,), cls.fields(components))}
+    def layouts(cls, words: Collection[str]) -> dict[str, Layout]:
+        """Return the layout of the components in columns, of one as an example where none is."""
+        columns = tuple(c for c, column in COMPONENTS.items() if cls.prefix + column in words)
+        return {cls.name: cls.layout_of(columns or ("circumferential",))}
 
-    def block(self, name: str, values: np.ndarray) -> Block:
-        """Return the places, and the components in the order of the basis."""
-        place, *columns = super().block(name, values)
-        order = [self.prefix + column for column in COMPONENTS.values()]
-        return [place, *sorted(columns, key=lambda column: order.index(column[0].variable))]
-
-    def check_values(self, name: str, values: np.ndarray) -> None:
-        """Refuse infinite values, and those that no stretch has."""
-        super().check_values(name, values)
+    def fault(self, name: str, values: np.ndarray) -> str | None:
+        """Return a sentence on strains that no stretch has."""
         if (values <= _LEAST).any():
-            raise InputError(
-                f"data: {name} goes down to {np.nanmin(values):.3g}; a Green-Lagrange strain is "
+            return (
+                f"{name} goes down to {np.nanmin(values):.3g}; a Green-Lagrange strain is "
                 f"above {_LEAST}, where nothing is left of a length"
             )
+        return None
 
 
-@dataclass(frozen=True, eq=False)
-class Strain(Strains):
+class PointStrain(Strains):
     """Green-Lagrange strains (d, c) along ``components`` at ``points`` (d, 3) mm, without unit.
 
     In linear elements strains and directions are constant, and jump from one element to the next.
     """
 
-    components: tuple[str, ...]
-    points: np.ndarray
-    nodes: np.ndarray
-    members: np.ndarray
-    slopes: np.ndarray
-    directions: np.ndarray
-
     kind = "strain"
     usage = "strain:COMPONENT,...:N"
     name = "strain"
-    arguments = ("components", "points")
-    place_field = Field("position_strain", XYZ, where=True)
+    place_field = DataField("position_strain", XYZ, where=True)
     spread = staticmethod(lambda scene, _, count, seed: spread_landmarks(scene, count, seed))
 
     @classmethod
@@ -171,25 +159,21 @@ class Strain(Strains):
 class SegmentStrain(Strains):
     """Mean Green-Lagrange strains (d, c) of ``segments`` (d,) along ``components``, without unit.
 
-    points : the segments' centroids, mm, (d, 3).
+    ``points`` are the segments' centroids.
+
     weights : share of each sample, a quadrature point, in each segment's volume, (d, s).
     """
 
-    components: tuple[str, ...]
     segments: np.ndarray
-    points: np.ndarray
     weights: np.ndarray
-    nodes: np.ndarray
-    members: np.ndarray
-    slopes: np.ndarray
-    directions: np.ndarray
 
     kind = "segment_strain"
     usage = "segment_strain:COMPONENT,..."
     name = "segment_strain"
     prefix = "mean_"
-    arguments = ("components", "segments")
-    place_field = Field("segment", ("segment",), where=True)
+    place = numbers = "segments"
+    row = "segment"
+    place_field = DataField("segment", ("segment",), where=True)
     constants = {}  # a segment's number says where it is
 
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
@@ -203,7 +187,7 @@ class SegmentStrain(Strains):
 
         Parameters
         ----------
-        components : the components, see :meth:`Strain.of`.
+        components : the components, see :meth:`PointStrain.of`.
         segments : numbers of segments from 1 on; by default all 17.
 
         Raises
@@ -230,14 +214,10 @@ class SegmentStrain(Strains):
         points = weights @ X.reshape(-1, 3)
         nodes, members = gather(mesh.elements[element])
         slopes = _slopes(gradients, directions)
-        return cls(names, segments, points, weights, nodes, members, slopes, directions)
-
-    def rows(self) -> tuple[str, np.ndarray]:
-        """Return the numbers of the segments."""
-        return "segment", self.segments
+        return cls(names, points, nodes, members, slopes, directions, segments, weights)
 
 
-strains = Strain.of
+strains = PointStrain.of
 segment_strains = SegmentStrain.of
 
 

@@ -32,10 +32,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibrate.measurements.observation import Block, Field, Table
+from calibrate.measurements.observation import DataField, Layout, derive
 from calibrate.measurements.specimens import Components
 from emulator.core.errors import InputError
-from emulator.core.units import IN_KPA, IN_MM2, IN_MN, factor, other_units
+from emulator.core.units import IN_KPA, IN_MM2, IN_MN, factor
 from emulator.mechanics.kinematics import cofactor, determinant
 from emulator.scenes.scene import Scene
 from emulator.scenes.states import (
@@ -76,8 +76,6 @@ class Stress(Components):
     pattern = _COMPONENT
     such_as = "give stress, cauchy or second with its plane, such as stress_x or stress_xy"
     unit = "kPa"
-    other_units = other_units(IN_KPA, "MPa", "Pa", "mmHg")
-    value_fields = (Field("stress_x", ("stress_x",)),)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -85,13 +83,13 @@ class Stress(Components):
             self._check_grips(self.scene.grips.learned.shares[0])
 
     def gripped(self, shares: np.ndarray) -> Self:
-        """Return the same stresses with what grips add, (d, 3, 3) as shares of a state's stress.
+        """Return the stresses with those that grips add, see :func:`gripped_observations`.
 
         :class:`InputError` where a component acts on no grip.
         """
         self._check_grips(shares)
-        part = copy(self)  # with the entries that are not missing
-        part._derive(shares=jnp.asarray(np.nan_to_num(shares)))
+        part = copy(self)
+        derive(part, shares=jnp.asarray(np.nan_to_num(shares)))
         return part
 
     def _check_grips(self, shares: np.ndarray) -> None:
@@ -118,18 +116,18 @@ class Stress(Components):
         return jnp.stack(numbers)
 
     @classmethod
-    def tables(cls, words: Collection[str]) -> dict[str, Table]:
-        """Return the table of the columns of motions and stresses; of one each as an example."""
-        given = [word for word in words if is_stress(word)]
-        if not given and pull_columns(words):  # of measured stretches
+    def layouts(cls, words: Collection[str]) -> dict[str, Layout]:
+        """Return the layout of the columns of motions and stresses; of one each as an example."""
+        stresses = [word for word in words if is_stress(word)]
+        if not stresses and pull_columns(words):  # of measured stretches
             return {}
-        areas = [w for w in words if given and _AREA.fullmatch(with_unit(w)[0])]
-        columns = [*(motion_columns(words) or ["stretch_x"]), *(given or ["stress_x"]), *areas]
-        return {cls.name: Table((), tuple(Field(word, (word,)) for word in columns))}
+        areas = [w for w in words if stresses and _AREA.fullmatch(with_unit(w)[0])]
+        columns = [*(motion_columns(words) or ["stretch_x"]), *(stresses or ["stress_x"]), *areas]
+        return {cls.name: Layout((), tuple(DataField(word, (word,)) for word in columns))}
 
     @classmethod
     def read(
-        cls, scene: Scene, name: str, table: Table, arrays: Mapping[str, np.ndarray]
+        cls, scene: Scene, layout: Layout, arrays: Mapping[str, np.ndarray]
     ) -> tuple[Self, np.ndarray]:
         """Return the observation and its data in kPa, of the states that the scene has."""
         columns = _in_kpa(arrays)
@@ -138,9 +136,9 @@ class Stress(Components):
         values = np.column_stack(list(columns.values()))
         part._check_signs(values)
         pulled = ~np.isnan(components_of(motions)[1])
-        for component, each in columns.items():
+        for component, stress in columns.items():
             _, row, column = _parts(component)
-            if row == column and (pulled[:, row] & ~np.isnan(each)).any():
+            if row == column and (pulled[:, row] & ~np.isnan(stress)).any():
                 raise InputError(
                     f"column '{component}' is the stress of a direction that has 'applied_"
                     f"{AXES[row]}': what the machine applies is no data, leave the column out"
@@ -164,11 +162,6 @@ class Stress(Components):
                     "kPa)"
                 )
 
-    def block(self, name: str, values: np.ndarray) -> Block:
-        """Return the motion of each state, and the stresses."""
-        of_stress = zip(self.components, values.reshape(len(values), -1).T, strict=True)
-        return [*self.motion(), *((Field(word, (word,)), x) for word, x in of_stress)]
-
 
 def is_stress(word: str) -> bool:
     """Return whether a column has stresses, or forces that become some."""
@@ -178,9 +171,9 @@ def is_stress(word: str) -> bool:
 
 def _parts(component: str) -> tuple[str, int, int]:
     """Return the measure of a component, its row and its column."""
-    found = _COMPONENT.fullmatch(component)
-    assert found is not None
-    measure, row, column = found.groups()
+    match = _COMPONENT.fullmatch(component)
+    assert match is not None
+    measure, row, column = match.groups()
     return measure, AXES.index(row), AXES.index(column or row)
 
 
@@ -189,18 +182,18 @@ def _in_kpa(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     areas, columns = dict[str, np.ndarray](), dict[str, tuple[str, np.ndarray]]()
     for word, values in arrays.items():
         name, unit = with_unit(word)
-        if (found := _AREA.fullmatch(name)) is not None:
-            areas[found[1]] = values * factor(word, unit, "mm2", IN_MM2)
+        if (match := _AREA.fullmatch(name)) is not None:
+            areas[match[1]] = values * factor(word, unit, "mm2", IN_MM2)
     for word, values in arrays.items():
         name, unit = with_unit(word)
         if _COMPONENT.fullmatch(name) is not None:
             component, stress = name, values * factor(word, unit, "kPa", IN_KPA)
-        elif (found := _PULL.fullmatch(name)) is not None:
-            if (area := areas.get(found[1])) is None:
+        elif (match := _PULL.fullmatch(name)) is not None:
+            if (area := areas.get(match[1])) is None:
                 raise InputError(
-                    f"column '{word}' is a force; give the area at rest as well, 'area{found[1]}'"
+                    f"column '{word}' is a force; give the area at rest as well, 'area{match[1]}'"
                 )
-            component = f"stress{found[1]}"
+            component = f"stress{match[1]}"
             stress = values * factor(word, unit, "mN", IN_MN) / area
         else:
             continue

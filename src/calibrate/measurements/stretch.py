@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibrate.measurements.observation import Block, Field, Table
+from calibrate.measurements.observation import DataField, Layout
 from calibrate.measurements.specimens import Components
 from emulator.scenes.scene import Scene
 from emulator.scenes.states import (
@@ -50,8 +50,6 @@ class Stretch(Components):
     name = "stretch"
     quantity = "stretch"
     unit = "1"
-    other_units = {"%": 0.01}
-    value_fields = (Field("stretch_x", ("stretch_x",)),)
     pattern = re.compile("stretch_([xyz])")
     such_as = "one of stretch_x, stretch_y, stretch_z"
     curve_axis = "way from the first state of each test, as a share of its largest pull"
@@ -65,21 +63,21 @@ class Stretch(Components):
 
     def _measured(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         corners = self.scene.mesh.elements
-        own = [1.0 + u[corners[:, 1 + k], k] - u[corners[:, 0], k] for k in self._axes]
+        stretches = [1.0 + u[corners[:, 1 + k], k] - u[corners[:, 0], k] for k in self._axes]
         # Half a turn of a piece that is pulled along one axis is an equilibrium, too, of FEM's.
-        return jnp.abs(jnp.stack(own, axis=1))
+        return jnp.abs(jnp.stack(stretches, axis=1))
 
     @classmethod
-    def tables(cls, words: Collection[str]) -> dict[str, Table]:
-        """Return the table of the columns of motions and pulls; of one each as an example."""
+    def layouts(cls, words: Collection[str]) -> dict[str, Layout]:
+        """Return the layout of the columns of motions and pulls; of one each as an example."""
         pulls, stretches = pull_columns(words), stretch_columns(words)
         columns = [*motion_columns(words), *([] if pulls else [f"{APPLIED}_x"])]
         columns += [] if stretches.keys() & pulls.keys() else [f"stretch_{min(pulls, default='x')}"]
-        return {cls.name: Table((), tuple(Field(w, (w,)) for w in dict.fromkeys(columns)))}
+        return {cls.name: Layout((), tuple(DataField(w, (w,)) for w in dict.fromkeys(columns)))}
 
     @classmethod
     def read(
-        cls, scene: Scene, name: str, table: Table, arrays: Mapping[str, np.ndarray]
+        cls, scene: Scene, layout: Layout, arrays: Mapping[str, np.ndarray]
     ) -> tuple[Self, np.ndarray]:
         """Return the observation and its data, NaN where the stretch is prescribed."""
         axes = sorted(pull_columns(arrays).keys() & stretch_columns(arrays).keys())
@@ -88,14 +86,9 @@ class Stretch(Components):
         stretches = 1.0 + np.where(np.isnan(pulls), np.nan, np.diagonal(H, axis1=1, axis2=2))
         return part, stretches[:, part._axes]
 
-    def block(self, name: str, values: np.ndarray) -> Block:
-        """Return the motion and the pulls of each state, with the stretches where they are free."""
-        pulls = [f"{APPLIED}_{component[-1]}" for component in self.components]
-        arrays = {field.variable: x for field, x in self.motion(pulls)}
-        for k, component in enumerate(self.components):
-            given = self.stretches[:, self._axes[k]]
-            arrays[component] = np.where(np.isnan(given), values[:, k], given)
-        return [(Field(word, (word,)), x) for word, x in arrays.items()]
+    @property
+    def _pulls(self) -> list[str]:
+        return [f"{APPLIED}_{component[-1]}" for component in self.components]
 
 
 stretches = Stretch.of

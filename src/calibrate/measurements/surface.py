@@ -41,7 +41,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from calibrate.measurements.location import closest_point, facet_shapes
-from calibrate.measurements.observation import LENGTH_UNITS, Field, Table
+from calibrate.measurements.observation import DataField, Layout
 from calibrate.measurements.points import (
     XYZ,
     DisplacementPoints,
@@ -72,16 +72,16 @@ def spread_on_surface(scene: Scene, facet_set: str, count: int, seed: int) -> np
 class OfFacetSet(PointObservation):
     """An observation of a facet set, whose name is part of the names of columns."""
 
-    arguments = ("facet_set", "points")
+    arguments = ("facet_set",)
 
     @classmethod
-    def tables(cls, words: Collection[str]) -> dict[str, Table]:
-        """Return a table for each facet set in columns; a placeholder if only the kind is named."""
+    def layouts(cls, words: Collection[str]) -> dict[str, Layout]:
+        """Return the layout of each facet set in columns; an example where only the kind is."""
         (field,) = cls.value_fields
         prefixes = [name.format("") for name in (field.variable, *field.columns)]
         sets = {w.removeprefix(p): None for w in words for p in prefixes if w.startswith(p)}
         named = sets or (("FACETSET",) if cls.kind in words else ())
-        return {cls.name.format(name): Table((name,), cls.fields(name)) for name in named}
+        return {cls.name.format(name): cls.layout_of(name) for name in named}
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,11 +106,10 @@ class SurfacePoints(OfFacetSet):
     usage = "surface:FACETSET:N"
     quantity = "normal displacement"
     unit = "mm"
-    other_units = LENGTH_UNITS
     usual_sd = 0.5
     name = "surface:{}"
-    place_field = Field("position_{}", XYZ, where=True)
-    value_fields = (Field("un:{}", ("un:{}",)),)
+    place_field = DataField("position_{}", XYZ, where=True)
+    value_fields = (DataField("un:{}", ("un:{}",)),)
     components = ()
     spread = staticmethod(spread_on_surface)
     constants = {"position": "points", "normal": "normals"}
@@ -192,8 +191,8 @@ class RigidMarkers(DisplacementPoints, OfFacetSet):
     usage = "markers:FACETSET (positions from a file)"
     quantity = "marker displacement"
     name = "markers:{}"
-    place_field = Field("position_markers_{}", XYZ, where=True)
-    value_fields = (Field("markers:{}", ("mx:{}", "my:{}", "mz:{}")),)
+    place_field = DataField("position_markers_{}", XYZ, where=True)
+    value_fields = (DataField("markers:{}", ("mx:{}", "my:{}", "mz:{}")),)
 
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
         """Return displacements (..., d, 3) in mm."""
@@ -206,15 +205,7 @@ class RigidMarkers(DisplacementPoints, OfFacetSet):
         return shift[..., None, :] + jnp.einsum("...ij,dj->...di", rotation, arms) - arms
 
     @classmethod
-    def parse(cls, scene: Scene, word: str, seed: int) -> tuple[str, Self]:
-        """Refuse ``markers:...``: pins cannot be drawn at random."""
-        raise InputError(
-            f"observe '{word}': markers stand where they were put; give their positions in a file, "
-            "columns x,y,z,mx:FACETSET,my:FACETSET,mz:FACETSET"
-        )
-
-    @classmethod
-    def of(cls, scene: Scene, facet_set: str, points: Any) -> Self:
+    def of(cls, scene: Scene, facet_set: str, points: Any = None) -> Self:
         """Return the observation of markers on pins that stand on a surface and turn with it.
 
         Parameters
@@ -225,8 +216,14 @@ class RigidMarkers(DisplacementPoints, OfFacetSet):
         Raises
         ------
         InputError
-            An unknown facet set, or one without extent; a marker given twice, or far from the body.
+            An unknown facet set, or one without extent; a marker given twice, or far from the body;
+            no markers, because they cannot be drawn at random.
         """
+        if points is None:
+            raise InputError(
+                f"observe 'markers:{facet_set}': markers stand where they were put; give their "
+                "positions in a file, columns x,y,z,mx:FACETSET,my:FACETSET,mz:FACETSET"
+            )
         points = as_points(points, "markers")
         mesh, facets = scene.mesh, scene.mesh.facet_set(facet_set)
         low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)

@@ -9,16 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibrate.measurements.observation import Block, Field, Table
+from calibrate.measurements.observation import DataField, Layout
 from calibrate.measurements.specimens import SpecimenCurves
 from emulator.core.errors import InputError
-from emulator.core.units import IN_KPA, IN_MN, factor, other_units
+from emulator.core.units import IN_KPA, IN_MN, factor
 from emulator.mechanics.kinematics import determinant
 from emulator.scenes.scene import Scene
 from emulator.scenes.states import with_unit
@@ -39,7 +39,6 @@ class OfTube(SpecimenCurves):
     column: ClassVar[str]
     units: ClassVar[Mapping[str, float]]
     integral: ClassVar[Callable[[Tube, jax.Array, jax.Array], jax.Array]]
-    arguments = ()
     components = ()
 
     def __post_init__(self) -> None:
@@ -52,34 +51,35 @@ class OfTube(SpecimenCurves):
         F = H + jnp.eye(3)
         cauchy = jax.vmap(lambda P, F: P @ F.T / determinant(F))(P, F)
         assert self.scene.tube is not None
-        in_plane = (jnp.diagonal(each, axis1=1, axis2=2)[:, :2] for each in (F, cauchy))
+        in_plane = (jnp.diagonal(tensor, axis1=1, axis2=2)[:, :2] for tensor in (F, cauchy))
         return type(self).integral(self.scene.tube, *in_plane)
 
     @classmethod
-    def tables(cls, words: Collection[str]) -> dict[str, Table]:
-        """Return the table of the columns of motion and of the number; none without motion."""
-        given = [w for w in words if with_unit(w)[0] == cls.column] or [cls.column]
+    def layouts(cls, words: Collection[str]) -> dict[str, Layout]:
+        """Return the layout of the columns of motion and of the number; none without motion."""
+        number = next((w for w in words if with_unit(w)[0] == cls.column), cls.column)
         motion = motion_columns(words)
         if not motion and cls.name not in words:  # a column 'pressure' may be of another file
             return {}
-        columns = [*(motion or ["outer_radius", "stretch_axial"]), given[0]]
-        fields = [Field(word, (word,), where=word != given[0]) for word in columns]
-        return {cls.name: Table((), tuple(fields))}
+        columns = [*(motion or ["outer_radius", "stretch_axial"]), number]
+        fields = [DataField(word, (word,), where=word != number) for word in columns]
+        return {cls.name: Layout((), tuple(fields))}
+
+    @classmethod
+    def values_in(cls, *selection: Any) -> tuple[DataField, ...]:
+        """Return the field of the number."""
+        return (DataField(cls.column, (cls.column,)),)
 
     @classmethod
     def read(
-        cls, scene: Scene, name: str, table: Table, arrays: Mapping[str, np.ndarray]
+        cls, scene: Scene, layout: Layout, arrays: Mapping[str, np.ndarray]
     ) -> tuple[Self, np.ndarray]:
         """Return the observation and its data, of the states that the scene has."""
-        *_, measured = table.fields
+        *_, measured = layout.fields
         part = cls(scene).check_motion({w: arrays[w] for w in motion_columns(arrays)})
         word = measured.variable
         values = arrays[word] * factor(word, with_unit(word)[1], cls.unit, cls.units)
         return part, values
-
-    def block(self, name: str, values: np.ndarray) -> Block:
-        """Return the motion of each state, and the number."""
-        return [*self.motion(), (Field(self.column, (self.column,)), values)]
 
 
 class TubePressure(OfTube):
@@ -90,7 +90,6 @@ class TubePressure(OfTube):
     column = "pressure"
     unit = "kPa"
     units = IN_KPA
-    other_units = other_units(IN_KPA, "mmHg", "Pa", "MPa")
     integral = Tube.pressure
 
 
@@ -102,5 +101,4 @@ class TubeForce(OfTube):
     column = "force_axial"
     unit = "mN"
     units = IN_MN
-    other_units = other_units(IN_MN, "N", "gf")
     integral = Tube.axial_force

@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibrate.measurements.observation import Scalar
+from calibrate.measurements.observation import Scalar, derive
+from emulator.core.units import KPA_PER_MMHG
 from emulator.geometry.facets import Cavity
-from emulator.scenes.loads import KPA_PER_MMHG
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene, find_cavity, inflated_cavity
 from emulator.surrogates.protocol import ForwardMap
@@ -42,27 +42,18 @@ class CavityVolume(Scalar):
     usage = "volume, volume:FACETSET"
     quantity = "volume"
     unit = "mL"
-    other_units = {"mm3": 1e-3, "L": 1e3, "m3": 1e6}
     usual_sd = 1.0
     arguments = ("facet_set",)
+    kind_is_name = True
 
     def __post_init__(self) -> None:
         cavity = find_cavity(self.scene, self.facet_set)
-        self._derive(cavity=cavity, facet_set=cavity.facet_set, nodes=cavity.nodes)
+        derive(self, cavity=cavity, facet_set=cavity.facet_set, nodes=cavity.nodes)
 
     @classmethod
     def of(cls, scene: Scene, facet_set: str = "") -> Self:
         """Return the observation of the cavity of this wall, or of the only one."""
         return cls(scene, facet_set or None)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """``volume`` and ``volume:<facet set>``."""
-        return self.kind, *super().names
-
-    def size_in(self, scene: Scene) -> float:
-        """Return the cavity's volume at rest, mL."""
-        return float(self.cavity.rest)
 
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the volume (...) in mL."""

@@ -51,14 +51,14 @@ class Measured:
 
     def shape(self, name: str) -> tuple[int, ...]:
         """Return the shape of an observation's data, missing values included."""
-        return self.observe.parts[name].restricted(None).shape
+        return self.observe.parts[name].shape
 
     def points(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return points at rest and their displacements, 0 where missing, both (d, 3) mm."""
         part = self.observe.parts[name]
         if not isinstance(part, DisplacementPoints):
             raise InputError(f"of: '{name}' is no displacement of points ({part.quantity})")
-        return part.points, np.nan_to_num(part.filled(np.asarray(self.data[name])))
+        return part.points, np.nan_to_num(self.observe.filled(name, np.asarray(self.data[name])))
 
     def known(self, parameter: str, name: str) -> float:
         """Return the known value of ``parameter`` in the load state of observation ``name``."""
@@ -76,12 +76,10 @@ class Measured:
         """Return ``error`` in the entries that are not missing."""
 
         def reduced(modes: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-            entries = {name: self.observe.parts[name].entries for name in modes}
+            entries = self.observe.entries
             return {
-                name: each
-                if entries[name] is None
-                else each.reshape(len(each), -1)[:, entries[name]]
-                for name, each in modes.items()
+                name: rows.reshape(len(rows), -1)[:, entries[name]] if name in entries else rows
+                for name, rows in modes.items()
             }
 
         return replace(error, modes=reduced(error.modes), shares=reduced(error.shares))

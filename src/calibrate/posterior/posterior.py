@@ -16,7 +16,8 @@ import numpyro.distributions as dist
 import xarray as xr
 
 from calibrate.arviz import base
-from calibrate.measurements import Observation, Observations, missing_values
+from calibrate.measurements import Observation, missing_values
+from calibrate.measurements.labels import labels_of
 from calibrate.posterior import predictions
 from calibrate.posterior.box import BoxEnd, box_ends
 from calibrate.posterior.diagnosis import Summary, diagnose, misfits, nothing_learned, summary_of
@@ -320,19 +321,6 @@ def make_tree(
         tree["posterior_predictive"] = xr.DataTree(replicated_group.assign_coords(draw=rows))
     _write_units(tree, model)
     return tree
-
-
-def labels_of(
-    observe: Observations,
-) -> tuple[dict[str, np.ndarray], dict[str, list[str]], dict[str, Any]]:
-    """Return constants, dimensions and coordinates of all observations."""
-    constants: dict[str, np.ndarray] = {}
-    dims: dict[str, list[str]] = {}
-    coords: dict[str, Any] = {}
-    for name, part in observe.parts.items():
-        more = part.labels(name)
-        constants, dims, coords = constants | more[0], dims | more[1], coords | more[2]
-    return constants, dims, coords
 
 
 def _write_units(tree: xr.DataTree, model: Model) -> None:

@@ -28,7 +28,7 @@ import numpy as np
 import numpyro.distributions as dist
 from numpyro import handlers
 
-from calibrate.measurements import Observation
+from calibrate.measurements import Observation, Observations
 from calibrate.measurements.klotz import PRESSURE_SCATTER, Klotz
 from calibrate.measurements.outputs import Outputs
 from calibrate.measurements.volume import pressure_volume
@@ -74,7 +74,7 @@ def log_likelihood(
 @kept
 def outputs_of(observe: Observation, forward: ForwardMap) -> Outputs:
     """Return the outputs; kept, so that a loop over pressures compiles once."""
-    return Outputs(forward, {"observed": observe})
+    return Outputs(forward, Observations({"observed": observe}))
 
 
 def replicates(

@@ -19,6 +19,7 @@ import numpy as np
 
 from calibrate.measurements import Observations, parse_observation
 from calibrate.measurements.data import read_measurements
+from calibrate.measurements.usual_noise import size_in, usual_noise
 from calibrate.priors import prior_of
 from calibrate.project.run import Run
 from calibrate.state_names import split
@@ -77,11 +78,11 @@ class Problem:
         noise, parts = self.run.noise, {split(n)[0]: p for n, p in self.observe.parts.items()}
         assert isinstance(noise, Mapping)
         return [
-            f"{name} has the default noise of so small a body ({part.size_in(self.scene):.2g} "
+            f"{name} has the default noise of so small a body ({size_in(part, self.scene):.2g} "
             f"{part.unit}), sd {noise[name]:g} {part.unit}: give your data's, --noise {name}=SD"
             for name, part in parts.items()
             if noise.get(name) != part.usual_sd is not None
-            and noise.get(name) == part.noise_in(self.scene).upper_sd
+            and noise.get(name) == usual_noise(part, self.scene).upper_sd
         ]
 
 
@@ -154,12 +155,12 @@ def with_data(problem: Problem) -> Problem:
     exact = jax.jit(observe)(jnp.stack(fields), thetas)
     rng = np.random.default_rng([run.seed, 1])
     data = {
-        name: np.asarray(exact[name]) + noises[name].simulate(rng, part.shape)
-        for name, part in observe.parts.items()
+        name: np.asarray(exact[name]) + noises[name].simulate(rng, shape)
+        for name, shape in observe.shapes.items()
     }
     with naming("synthetic, of too much noise (--noise)"):
-        for name, part in observe.parts.items():
-            part.check(name, data[name])
+        for name, values in data.items():
+            observe.check(name, values)
     return replace(problem, data=data)
 
 

@@ -153,7 +153,7 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
     )
     observed = tree["observed_data"]
     data = run_model.check_data(
-        {n: np.asarray(observed[n]).reshape(part.shape) for n, part in observe.parts.items()}
+        {n: np.asarray(observed[n]).reshape(shape) for n, shape in observe.shapes.items()}
     )
     return run, Posterior(tree, run_model, data)
 

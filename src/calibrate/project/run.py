@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calibrate.measurements import DISPLACEMENT, Observations
+from calibrate.measurements.usual_noise import usual_noise
 from calibrate.model_error.kinds import read_systematic
 from calibrate.noise import Noise, noise_of
 from calibrate.priors import Population
@@ -146,7 +147,7 @@ class Run:
         noise = _by_name(self.noise, observe, "noise")
         expanded = observe.expand(noise, "noise")
         defaults = {
-            split(name)[0]: (part.noise_in(scene) if scene else part.default_noise).upper_sd
+            split(name)[0]: usual_noise(part, scene).upper_sd
             for name, part in observe.parts.items()
             if name not in expanded
         }

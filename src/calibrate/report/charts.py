@@ -16,7 +16,9 @@ from calibrate.analysis.identifiability import stress_band
 from calibrate.figures import BLUE, COLOURS, VERMILION, with_unit
 from calibrate.measurements import Observation
 from calibrate.measurements.klotz import klotz_of
+from calibrate.measurements.specimens import SpecimenCurves
 from calibrate.measurements.volume import PressureVolume, in_mmhg, pressure_volume
+from calibrate.measurements.words import to_json
 from calibrate.posterior import Posterior
 from calibrate.state_names import split
 from emulator.scenes.loads import KPA_PER_MMHG
@@ -59,8 +61,9 @@ def against_data(posterior: Posterior) -> Iterator[tuple[str, go.Figure]]:
         values = np.asarray(tree["posterior_predictive"][name])
         values = values.reshape(values.shape[0] * values.shape[1], -1)
         data = np.ravel(np.asarray(posterior.data[name]))
-        if part.curves:
-            yield name, _curves(part, values, data)
+        if isinstance(part, SpecimenCurves):
+            curves = part.curves(posterior.model.observe.entries.get(name))
+            yield name, _curves(part, curves, values, data)
             continue
         if values.shape[1] > 1:
             yield name, _many_numbers(name, part, values, data)
@@ -101,11 +104,16 @@ def _many_numbers(name: str, part: Observation, values: np.ndarray, data: np.nda
     return figure
 
 
-def _curves(part: Observation, values: np.ndarray, data: np.ndarray) -> go.Figure:
+def _curves(
+    part: SpecimenCurves,
+    curves: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    values: np.ndarray,
+    data: np.ndarray,
+) -> go.Figure:
     """Return each curve of an observation: data, and the 90 % band of predictions."""
     low, high = np.nanquantile(values, [0.05, 0.95], axis=0)
     figure = go.Figure()
-    for k, (label, (x, rows)) in enumerate(part.curves.items()):
+    for k, (label, (x, rows)) in enumerate(curves.items()):
         colour = COLOURS[k % len(COLOURS)]
         figure.add_scatter(
             x=[*x, *x[::-1]], y=[*high[rows], *low[rows][::-1]], fill="toself", line_width=0,
@@ -272,7 +280,7 @@ def _measured_volumes(
     volumes, model = {}, posterior.model
     column = model.forward.scene.parameter_names.index(curve.parameter.name)
     for observation, part in model.observe.parts.items():
-        if part.to_json() == curve.volume.to_json():
+        if to_json(part) == to_json(curve.volume):
             pressures = np.asarray(posterior.thetas(split(observation)[1])[:, column])
             volumes[observation] = float(posterior.data[observation]), pressures
     return volumes

@@ -14,6 +14,7 @@ from jax.flatten_util import ravel_pytree
 
 from calibrate.measurements import Observations
 from calibrate.measurements.outputs import on_finer
+from calibrate.measurements.specimens import gripped_observations
 from calibrate.statistical_model.model import Model
 from emulator.accuracy.mesh_error import MeshError, MeshErrorEstimate, mesh_error
 from emulator.fem import Simulator
@@ -134,7 +135,7 @@ class _Gripped:
         solution = self.gripped.homogeneous.solve(theta).require_converged("the specimen")
         fields, thetas = [solution.displacement], theta[None]
         shares = self.gripped.shares(theta)
-        fine = _flat(self.model.observe.gripped(shares), fields, thetas)
+        fine = _flat(gripped_observations(self.model.observe, shares), fields, thetas)
         return MeshPair(fine, _flat(self.model.observe, fields, thetas))
 
     def forget(self) -> None:

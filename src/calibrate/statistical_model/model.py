@@ -301,7 +301,7 @@ class Model:
         missing.
         """
         observe, present = leave_out_missing(self.observe, self._fitting(data))
-        if all(part is self.observe.parts[name] for name, part in observe.parts.items()):
+        if observe is self.observe:
             return self, self.check_data(present)
         if self.error is not None:
             raise InputError(
@@ -348,10 +348,10 @@ class Model:
             name: np.asarray(values, dtype=float)
             for name, values in self.observe.name(data, "data").items()
         }
-        for name, part in self.observe.parts.items():
-            if part.shape == () and named[name].shape == (1,):
+        for name, shape in self.observe.shapes.items():
+            if shape == () and named[name].shape == (1,):
                 named[name] = named[name].reshape(())
-            part.check(name, named[name])
+            self.observe.check(name, named[name])
         return named
 
 
@@ -428,9 +428,9 @@ def model(
 def at_sites(noise: Mapping[str, Noise], observe: Observations) -> dict[str, Noise]:
     """Return each noise at the sites of its observation; InputError names the observation."""
     bound = {}
-    for name, part in observe.parts.items():
+    for name in observe.parts:
         try:
-            bound[name] = noise[name].at(part.sites)
+            bound[name] = noise[name].at(observe.sites(name))
         except InputError as error:
             raise InputError(f"noise of {name}: {error}") from error
     return bound

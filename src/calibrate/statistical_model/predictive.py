@@ -334,7 +334,7 @@ class Predictive:
     def scales(self) -> np.ndarray:
         """Noise sd (m,) of each of the flat data, in its unit."""
         sds = noise_sds(self.model, self.draws)
-        levels = {n: np.full(part.shape, sds[n]) for n, part in self.model.observe.parts.items()}
+        levels = {n: np.full(shape, sds[n]) for n, shape in self.model.observe.shapes.items()}
         return np.asarray(ravel_pytree(levels)[0])
 
     @cached_property
@@ -359,8 +359,8 @@ class Predictive:
 
     def by_name(self, flat: jax.Array) -> dict[str, jax.Array]:
         """Return flat data (m,) by the observation's name."""
-        parts = self.model.observe.parts
-        return ravel_pytree({name: jnp.zeros(parts[name].shape) for name in parts})[1](flat)
+        shapes = self.model.observe.shapes
+        return ravel_pytree({n: jnp.zeros(shape) for n, shape in shapes.items()})[1](flat)
 
     @_compiled
     def _map_block(self, z: jax.Array) -> Any:

@@ -42,6 +42,23 @@ def factor(word: str, unit: str, usual: str, known: Mapping[str, float]) -> floa
     return known[plain]
 
 
-def other_units(known: Mapping[str, float], *names: str) -> dict[str, float]:
-    """Return the factors of units ``names`` that data may be in by mistake."""
-    return {name: known[name] for name in names}
+_MISTAKEN = (
+    (IN_KPA, ("kPa", "MPa", "Pa", "mmHg")),
+    (IN_MN, ("mN", "N", "gf", "kN")),
+    (IN_MM, ("mm", "m", "cm", "µm")),
+    (IN_MM2, ("mm2", "m2", "cm2")),
+    (IN_ML, ("mL", "mm3", "L", "m3")),
+    ({"1": 1.0, "%": 0.01}, ("1", "%")),
+)
+"""Units that are taken for one another."""
+
+
+def other_units(unit: str) -> dict[str, float]:
+    """Return the units that data in ``unit`` may be in by mistake, each with the factor to it."""
+    return {
+        name: known[name] / known[unit]
+        for known, names in _MISTAKEN
+        if unit in names
+        for name in names
+        if name != unit
+    }

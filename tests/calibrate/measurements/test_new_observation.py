@@ -10,7 +10,7 @@ import pytest
 import calibrate as cal
 from calibrate.measurements import OBSERVATIONS, Scalar, observations_from_json, parse_observation
 from calibrate.measurements.data import read_measurements, write_data
-from calibrate.posterior.posterior import labels_of
+from calibrate.measurements.labels import labels_of
 from calibrate.project import Run, make_data
 from emulator.core.errors import InputError
 from linear_support import linear_forward
@@ -28,7 +28,6 @@ class Area(Scalar):
     usage = "area:NODE,NODE,NODE"
     quantity = "area"
     unit = "mm2"
-    other_units = {"m2": 1e6, "cm2": 100.0}  # noqa: RUF012
     usual_sd = 0.1
     arguments = ("corners",)
 

@@ -70,7 +70,8 @@ def test_measured_surface_points_are_on_the_surface_give_or_take(beam):
 
 def test_descriptions_make_the_same_operator(beam):
     for observe in (cal.nodal_displacements(beam, [3, 9]), cal.landmarks(beam, [[10.0, 5.0, 5.0]])):
-        again = observations_from_json(beam, {"d": observe.to_json()}).parts["d"]
+        described = observations({"d": observe}).to_json()
+        again = observations_from_json(beam, described).parts["d"]
         np.testing.assert_array_equal(again.nodes, observe.nodes)
         np.testing.assert_array_equal(again.points, observe.points)
 

@@ -9,6 +9,8 @@ import calibrate as cal
 import emulator as em
 from calibrate.measurements import Reaction, observations_from_json, parse_observation
 from calibrate.measurements.data import read_measurements, write_data
+from calibrate.measurements.observation import check_values
+from calibrate.measurements.usual_noise import usual_noise
 from emulator.core.errors import InputError
 from emulator.surrogates.taylor import expand
 from scene_support import between_plates
@@ -107,7 +109,7 @@ def test_forces_of_what_is_no_support(simulator, word, said):
 def test_a_force_has_no_usual_noise(simulator):
     seen = Reaction(simulator.scene, "top", "x")
     with pytest.raises(InputError, match="give --noise reaction:top:x=SD, in N"):
-        _ = seen.default_noise
+        usual_noise(seen)
     with pytest.raises(InputError, match="must be finite"):
-        seen.check("reaction:top:x", np.asarray(np.inf))
-    seen.check("reaction:top:x", np.asarray(-0.3))
+        check_values(seen, "reaction:top:x", np.asarray(np.inf))
+    check_values(seen, "reaction:top:x", np.asarray(-0.3))

@@ -166,9 +166,7 @@ def test_words_files_json_and_batches(ventricle, tmp_path):
         assert set(back.parts) == set(observe.parts)
         for name in one:
             np.testing.assert_array_equal(values[name], one[name])
-            for one_way, other in zip(
-                back.parts[name].sites, observe.parts[name].sites, strict=True
-            ):
+            for one_way, other in zip(back.sites(name), observe.sites(name), strict=True):
                 np.testing.assert_array_equal(one_way, other)
     again = observations_from_json(ventricle, json.loads(json.dumps(observe.to_json())))
     for name, part in again.parts.items():
@@ -229,9 +227,9 @@ def test_what_cannot_be_observed(ventricle, beam):
         segment_strains(ventricle, "fibre", [3, 3])
     observe = observations(segment_strains(ventricle, "fibre"))
     with pytest.raises(InputError, match="goes down to -20; a Green-Lagrange strain is above -0.5"):
-        observe.parts["segment_strain"].check("segment_strain", np.full((17, 1), -20.0))
+        observe.check("segment_strain", np.full((17, 1), -20.0))
     with pytest.raises(InputError, match=r"shape \(16, 1\); the observation expects \(17, 1\)"):
-        observe.parts["segment_strain"].check("segment_strain", np.zeros((16, 1)))
+        observe.check("segment_strain", np.zeros((16, 1)))
 
 
 @pytest.mark.parametrize(

@@ -151,7 +151,9 @@ def test_written_and_read_again(tmp_path):
 
 def test_errors_correlate_along_a_curve_and_not_between_tests():
     given = states({"stretch_x": np.array([1.0, 1.1, 1.0, 1.3])}, ["a", "a", "b", "b"])
-    sites = Stress.of(neo_hookean(given), "stress_x,stress_y").sites
+    observe = observations(Stress.of(neo_hookean(given), "stress_x,stress_y"))
+    sites = observe.sites("stress")
+    assert sites is not None
     np.testing.assert_allclose(sites.positions[::2, 0], [0.0, 0.1, 0.0, 0.3])
     assert len(np.unique(sites.positions[:, 1])) == 2
     np.testing.assert_array_equal(sites.component, [0, 1] * 4)

@@ -63,10 +63,9 @@ def test_stretches_are_data_where_a_stress_is_applied(tmp_path):
     assert observe.parts["stretch"].components == ("stretch_x",)
     np.testing.assert_allclose(data["stretch"][:, 0], [1.0, 1.05, np.nan, np.nan, np.nan])
     np.testing.assert_allclose(data["stress"][:, 0], [np.nan, np.nan, np.nan, 0.0, 3.0])
-    sites = observe.parts["stretch"].sites
+    sites = observe.sites("stretch")
     np.testing.assert_allclose(sites.positions[:, 0], [0.0, 1 / 3, 1.0, 0.0, 0.1])
-    part = observe.parts["stretch"].restricted(np.array([0, 1]))
-    assert list(part.curves) == ["creep stretch_x"]
+    assert list(observe.parts["stretch"].curves(np.array([0, 1]))) == ["creep stretch_x"]
     u = np.asarray(em.homogeneous(scene)(jnp.array([MU])))
     turned = np.array(u)  # by half a turn about x, as FEM may find it
     corners = scene.mesh.elements[2]

@@ -126,7 +126,7 @@ def test_words_files_json(ventricle, tmp_path):
     again = observations_from_json(ventricle, json.loads(json.dumps(observe.to_json())))
     for name, part in again.parts.items():
         np.testing.assert_allclose(part.points, observe.parts[name].points, atol=1e-12)
-    sites = observe.parts["surface:endocardium"].sites
+    sites = observe.sites("surface:endocardium")
     assert sites.positions.shape == (4, 3)
     assert not sites.component.any()
 

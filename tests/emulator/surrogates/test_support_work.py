@@ -13,6 +13,7 @@ import pytest
 
 import calibrate as cal
 import emulator as em
+from calibrate.measurements import observations
 from calibrate.measurements.outputs import Outputs
 from emulator.fem.reactions import SupportForce
 from emulator.geometry.generators.box import box
@@ -166,7 +167,7 @@ def test_a_model_takes_it_cold_under_jit_and_in_batches(simulator, emulator):
     at = jax.jit(jax.vmap(predicted))(jnp.array([2.999, 3.0, 3.001]))
     assert float(at[1]) == pytest.approx(expected, rel=2e-3)
     assert float(slope) == pytest.approx(float(at[2] - at[0]) / 0.002, rel=1e-5)
-    outputs = Outputs(emulator.cache(), {"force": observe})
+    outputs = Outputs(emulator.cache(), observations({"force": observe}))
     assert outputs.values(theta[None])[0, 0] == pytest.approx(float(at[1]), rel=1e-9)
     assert outputs.slopes(theta[None])[0, 0, 0] == pytest.approx(float(slope), rel=1e-6)
 

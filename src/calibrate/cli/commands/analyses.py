@@ -62,6 +62,7 @@ def _after(arguments: Namespace) -> Answer:
         stress_band,
     )
     from calibrate.measurements import parse_observation
+    from calibrate.measurements.usual_noise import usual_noise
     from calibrate.project import read_posterior
 
     run, posterior = read_posterior(arguments.folder)
@@ -85,7 +86,7 @@ def _after(arguments: Namespace) -> Answer:
     candidates = {}
     for word in "+".join(arguments.next).split("+") if arguments.next else ():
         (part,) = parse_observation(scene, word, run.seed).parts.values()
-        candidates[word] = (part, part.noise_in(scene))
+        candidates[word] = (part, usual_noise(part, scene))
     if candidates:
         gains = next_measurement(posterior, candidates)
         rows = [
