@@ -18,6 +18,7 @@ from jax.flatten_util import ravel_pytree
 from scipy.special import bdtr
 
 from calibrate.analysis.term_sets import PRESENT, posterior_of_sets, seen_columns
+from calibrate.model_error.marginal import check_algebra
 from calibrate.noise import information_about_means
 from calibrate.statistical_model.model import Model
 from emulator.core.display import TableRepr
@@ -173,16 +174,16 @@ def _of_tests(model: Model) -> dict[str, np.ndarray]:
 
 def _whitening(model: Model) -> np.ndarray:
     """Return the matrix (n, n) that makes the noise independent, of sd 1."""
-    scales = {}
-    for name, noise in model.noise.items():
-        if not noise.gaussian:
-            raise InputError(f"terms: the noise of {name} must be Gaussian")
-        # A half-normal prior's scale: its mean over that of a standard one.
-        scales[name] = {
-            key: prior.mean * np.sqrt(np.pi / 2.0) for key, prior in noise.priors.items()
-        }
+    check_algebra("terms", model.noise, known=False)
+    # A half-normal prior's scale: its mean over that of a standard one.
+    scales = {
+        name: {key: prior.mean * np.sqrt(np.pi / 2.0) for key, prior in noise.priors.items()}
+        for name, noise in model.noise.items()
+    }
     means = {name: jnp.zeros(part.shape) for name, part in model.observe.parts.items()}
     information = np.asarray(information_about_means(model.noise, means, scales))
+    if information.ndim == 1:
+        return np.diag(np.sqrt(information))
     return np.linalg.cholesky(information).T
 
 

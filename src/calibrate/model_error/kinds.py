@@ -32,7 +32,7 @@ Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class Measurement:
     """The observations and data that systematic errors disturb.
 
     observe : the observations, without missing values.
@@ -104,11 +104,11 @@ class RigidMotion:
     about: Vector | None = None
     at: Literal["loaded", "rest"] = "loaded"
 
-    def systematic(self, name: str, measured: Measured) -> Systematic:
+    def systematic(self, name: str, measurement: Measurement) -> Systematic:
         """Return three shifts and three turns."""
         positions = {}
-        for each in measured.named(self.of):
-            points, displacement = measured.points(each)
+        for each in measurement.named(self.of):
+            points, displacement = measurement.points(each)
             positions[each] = points + displacement if self.at == "loaded" else points
         return rigid_motion(name, positions, self.shift, self.turn, self.about)
 
@@ -129,10 +129,10 @@ class Placement:
     def __post_init__(self) -> None:
         _check_not_negative(sd=self.sd)
 
-    def systematic(self, name: str, measured: Measured) -> Systematic:
+    def systematic(self, name: str, measurement: Measurement) -> Systematic:
         """Return one offset for each number."""
-        names = measured.named(self.of)
-        shapes = {measured.shape(each) for each in names}
+        names = measurement.named(self.of)
+        shapes = {measurement.shape(each) for each in names}
         if len(shapes) > 1:
             raise InputError(f"of: {', '.join(names)} have different numbers of points")
         sd = np.zeros(shapes.pop())
@@ -164,11 +164,11 @@ class Pins:
     def __post_init__(self) -> None:
         _check_not_negative(sd=self.sd)
 
-    def systematic(self, name: str, measured: Measured) -> Systematic:
+    def systematic(self, name: str, measurement: Measurement) -> Systematic:
         """Return one offset along each axis."""
         modes = {}
-        for each in measured.named(self.of):
-            points, displacement = measured.points(each)
+        for each in measurement.named(self.of):
+            points, displacement = measurement.points(each)
             if len(points) < 3 or np.linalg.matrix_rank(points - points.mean(axis=0)) < 2:
                 raise InputError(f"of: '{each}' has no three markers, not on one line")
             rows = self.sd * (rotation_of(points, displacement) - np.eye(3)).T
@@ -190,10 +190,10 @@ class Gain:
     def __post_init__(self) -> None:
         _check_not_negative(share=self.share)
 
-    def systematic(self, name: str, measured: Measured) -> Systematic:
+    def systematic(self, name: str, measurement: Measurement) -> Systematic:
         """Return one factor."""
-        names = measured.named(self.of)
-        shares = {each: np.full((1, *measured.shape(each)), self.share) for each in names}
+        names = measurement.named(self.of)
+        shares = {each: np.full((1, *measurement.shape(each)), self.share) for each in names}
         return Systematic((name,), {}, shares=shares)
 
 
@@ -233,13 +233,13 @@ class Curve:
         if not 0.0 <= self.constant <= 1.0:
             raise InputError(f"constant is {self.constant}; it is a part, 0 to 1")
 
-    def systematic(self, name: str, measured: Measured) -> Systematic:
+    def systematic(self, name: str, measurement: Measurement) -> Systematic:
         """Return as many unknowns as the curve can tell apart."""
-        observations = measured.named(self.of)
+        observations = measurement.named(self.of)
         for each in observations:
-            if measured.shape(each) != ():
+            if measurement.shape(each) != ():
                 raise InputError(f"of: '{each}' is not a single number, as a force is")
-        amounts = np.array([measured.known(self.along, each) for each in observations])
+        amounts = np.array([measurement.known(self.along, each) for each in observations])
         size = None if self.share_scale is None else ("curve_share", self.share_scale)
         unit = curve_modes(amounts, self.length, constant=self.constant)
         share = self.share if size is None else 1.0
@@ -257,7 +257,7 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Field:
+class FieldError:
     r"""An error of displacements that is smooth in space and grows along the loading.
 
     It is what image correlation and the model miss of a full field. Of a component at the point X,
@@ -296,14 +296,15 @@ class Field:
         if not 0.0 <= self.share < 1.0:
             raise InputError(f"share is {self.share}; it is a part of the variance, 0 to below 1")
 
-    def systematic(self, name: str, measured: Measured) -> Systematic:
+    def systematic(self, name: str, measurement: Measurement) -> Systematic:
         """Return as many unknowns as carry all but a share of the variance."""
-        observations = measured.named(self.of)
-        points, components = measured.points(observations[0])[0], measured.shape(observations[0])[1]
+        observations = measurement.named(self.of)
+        first = observations[0]
+        points, components = measurement.points(first)[0], measurement.shape(first)[1]
         for each in observations:
-            if not np.array_equal(measured.points(each)[0], points):
-                raise InputError(f"of: '{each}' and '{observations[0]}' are of other points")
-        amounts = np.array([measured.known(self.along, each) for each in observations])
+            if not np.array_equal(measurement.points(each)[0], points):
+                raise InputError(f"of: '{each}' and '{first}' are of other points")
+        amounts = np.array([measurement.known(self.along, each) for each in observations])
         if not np.abs(amounts).max() > 0.0:
             raise InputError(f"along: '{self.along}' is 0 in every state")
         along = np.ones((1, len(amounts)))
@@ -326,7 +327,7 @@ class Field:
         return Systematic(names, {n: rows[:, k] for k, n in enumerate(observations)}, size)
 
 
-Kind = RigidMotion | Placement | Pins | Gain | Curve | Field
+Kind = RigidMotion | Placement | Pins | Gain | Curve | FieldError
 
 SYSTEMATIC_ERRORS: dict[str, type[Kind]] = {
     "rigid_motion": RigidMotion,
@@ -334,7 +335,7 @@ SYSTEMATIC_ERRORS: dict[str, type[Kind]] = {
     "pins": Pins,
     "gain": Gain,
     "curve": Curve,
-    "field": Field,
+    "field": FieldError,
 }
 """Kinds of systematic error by their word in a file."""
 
