@@ -24,6 +24,7 @@ from calibrate.model_error.systematic import (
     rigid_motion,
     spatial_modes,
 )
+from calibrate.noise.protocol import Scale, check_positive
 from calibrate.state_names import split
 from emulator.core import schema
 from emulator.core.errors import InputError, look_up
@@ -222,14 +223,10 @@ class Curve:
     def __post_init__(self) -> None:
         _check_not_negative(share=self.share, sd=self.sd)
         if self.share_scale is not None:
-            if not self.share_scale > 0.0:
-                raise InputError(f"share_scale is {self.share_scale}; it must be above 0")
+            check_positive("share_scale", self.share_scale)
             if self.share or self.sd:
                 raise InputError("share_scale is beside share or sd; give one of them")
-        if not self.length > 0.0:
-            raise InputError(
-                f"length is {self.length}; it must be above 0, in the unit of the amount"
-            )
+        check_positive("length", self.length)
         if not 0.0 <= self.constant <= 1.0:
             raise InputError(f"constant is {self.constant}; it is a part, 0 to 1")
 
@@ -287,12 +284,10 @@ class FieldError:
     share: float = 0.01
 
     def __post_init__(self) -> None:
-        if (self.sd is None) == (self.sd_scale is None):
-            raise InputError("give either sd (known) or sd_scale (of its prior)")
-        given = {"length": self.length, "sd": self.sd, "sd_scale": self.sd_scale}
-        for name, value in {**given, "along_length": self.along_length}.items():
-            if value is not None and not value > 0.0:
-                raise InputError(f"{name} is {value}; it must be above 0")
+        Scale("field_sd", ("sd", "sd_scale"), self.sd, self.sd_scale)  # refuses what cannot be
+        check_positive("length", self.length)
+        if self.along_length is not None:
+            check_positive("along_length", self.along_length)
         if not 0.0 <= self.share < 1.0:
             raise InputError(f"share is {self.share}; it is a part of the variance, 0 to below 1")
 

@@ -24,12 +24,12 @@ likelihood of the residual r = y - g changes by
 
 .. math:: W - R^T P^{-1} R
 
-is left. Terms are eliminated in two groups, the second beside the information that the first
-leaves. The first has the terms of size 1 without shares, which leave the same for all x. Where the
-others have no shares, all their modes have one size, so that each group becomes one term with
-modes, chosen once, for which :math:`G = A W A^T` is diagonal: then L = I,
-:math:`P = I + \alpha^2 G`, and a likelihood of d numbers costs one product with the modes. Where
-one has shares, the second group is eliminated anew for each x.
+is left. Terms are joined to two, the second eliminated beside the information that the first
+leaves. The first are those of size 1 without shares, which leave the same for all x. Where the
+others have no shares, all their modes have one size, so that in both modes can be chosen, once, for
+which :math:`G = A W A^T` is diagonal: then L = I, :math:`P = I + \alpha^2 G`, and a likelihood of d
+numbers costs one product with the modes. Where one has shares, the second is eliminated anew for
+each x.
 
 Which terms and noises can be together follows from this algebra (:func:`check_algebra`).
 
@@ -40,7 +40,7 @@ be fitted too low by the factor :math:`1 + (n - 1) s^2` (Peelle's puzzle; D'Agos
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -61,7 +61,9 @@ Means = Mapping[str, jax.Array]
 LEARNED = "the size of the forward map's error is learned"
 """What is said of a size that is a function of the unknowns."""
 
-_SIZED, _VARYING = "sized_", "varying_"  # prefixes of the arrays of a second group
+_SIZED, _VARYING = "sized_", "varying_"  # prefixes of the arrays of a second term
+_DIAGONAL = ("weights", "strength", "modes", "mixing")  # arrays of a term that is diagonal, and
+_DENSE = ("modes", "shares", "sized", "information")  # of one that is not
 # Recorded in saved errors, because in earlier versions shares were of the data.
 _SHARES = "of the prediction"
 _OF_PREDICTION = "some are shares of what is predicted"
@@ -106,20 +108,25 @@ class Term:
 
     modes, shares : A and B, (r, d); no B where nothing is a share of the prediction.
     size : the size of the modes; ``None`` for 1.
+    sized : 0 for each mode whose size is 1 whatever ``size`` is, 1 for the others, (r,); ``None``
+        for 1.
     weights, strength : A W, (r, d), with W the information that terms before leave, and the
-        diagonal of G, (r,); ``None`` where the modes are not chosen such that G is diagonal.
+        diagonal of G, (r,), where the modes are chosen such that G is diagonal.
     mixing : orthogonal matrix (r, s) that makes such modes of the s declared ones, less the rows of
         modes that no datum could tell from nothing; ``None`` where the declared ones are forgotten.
+    information : W, (d, d), or its diagonal (d,), where they are not.
     names : names of the unknowns z of the declared modes of a systematic error.
-    of_fem : whether data differ from FEM on the map's mesh by these errors, too.
+    of_fem : whether data differ from FEM on the map's mesh by the modes of this size, too.
     """
 
     modes: np.ndarray
     shares: np.ndarray | None = None
     size: Amplitude | Scale | None = None
+    sized: np.ndarray | None = None
     weights: Any = None
     strength: Any = None
     mixing: Any = None
+    information: np.ndarray | None = None
     names: tuple[str, ...] = jax.tree.static(default=())
     of_fem: bool = jax.tree.static(default=True)
 
@@ -143,8 +150,21 @@ class Term:
 
     def at(self, alpha: Any, means: jax.Array) -> jax.Array:
         """Return V (r, d) where the size is ``alpha`` and the prediction ``means`` (d,)."""
+        if self.sized is not None:
+            alpha = jnp.where(self.sized > 0.0, alpha, 1.0)[:, None]
         modes = jnp.asarray(self.modes)
         return alpha * (modes if self.shares is None else modes + self.shares * means)
+
+    def eliminated(
+        self, unknowns: jax.Array, means: jax.Array, columns: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Return the pivots P (r,), and R ``columns`` (r, m) of columns (d, m)."""
+        alpha = self.alpha(unknowns)
+        if self.strength is not None:
+            return 1.0 + alpha**2 * self.strength, alpha * (self.weights @ columns)
+        V = self.at(alpha, means)
+        VW = times(V, self.information)
+        return eliminated(VW @ V.T + jnp.eye(len(V)), VW @ columns)
 
 
 @jax.tree_util.register_dataclass
@@ -153,31 +173,27 @@ class ModelError:
     """All errors of a model's data besides its noise, as :func:`marginalised` makes them.
 
     terms : the terms in the order in which they are eliminated.
-    information : W beside the terms that are not diagonal, which are eliminated anew for each x,
-        (d, d), or its diagonal (d,); ``None`` where all are.
     """
 
     terms: tuple[Term, ...] = ()
-    information: np.ndarray | None = None
 
     @property
-    def declared(self) -> tuple[Term, ...]:
+    def declarations(self) -> tuple[Term, ...]:
         """All terms, with the declared modes where these are known, to be integrated out anew."""
         return tuple(
-            Term(
-                t.modes if t.mixing is None else t.mixing.T @ t.modes,
-                t.shares,
-                t.size,
-                names=t.names,
-                of_fem=t.of_fem,
-            )
-            for t in self.terms
+            term if term.mixing is None else replace(term, modes=term.mixing.T @ term.modes)
+            for term in self.terms
         )
 
     @property
     def of_fem(self) -> ModelError:
         """The errors by which data differ from FEM on the map's mesh, too."""
-        return replace(self, terms=tuple(term for term in self.terms if term.of_fem))
+        terms = [term for term in self.terms if term.of_fem]
+        for term in self.terms:
+            if not term.of_fem and term.sized is not None:
+                rows = {n: getattr(term, n)[term.sized == 0.0] for n in _DENSE[:3]}
+                terms.append(replace(term, **rows, size=None, of_fem=True))
+        return ModelError(tuple(terms))
 
     @property
     def is_learned(self) -> bool:
@@ -209,8 +225,10 @@ class ModelError:
 
         unknowns : theta's unknowns (q,), then the size of :attr:`priors` if one is inferred.
         """
-        total, column = jnp.zeros(()), ravel_pytree(dict(residual))[0][:, None]
-        for pivots, rows in self._eliminated(unknowns, means, column):
+        total, means_flat = jnp.zeros(()), ravel_pytree(dict(means))[0]
+        column = ravel_pytree(dict(residual))[0][:, None]
+        for term in self.terms:
+            pivots, rows = term.eliminated(unknowns, means_flat, column)
             total += 0.5 * jnp.sum(rows[:, 0] ** 2 / pivots - jnp.log(pivots))
         return total
 
@@ -224,19 +242,23 @@ class ModelError:
         """
         if not self.terms:
             return information
+        flat = ravel_pytree(dict(means))[0]
         left = jnp.diag(information) if information.ndim == 1 else information
-        for pivots, rows in self._eliminated(unknowns, means, jnp.eye(len(information))):
+        for term in self.terms:
+            pivots, rows = term.eliminated(unknowns, flat, jnp.eye(len(information)))
             left = left - (rows.T / pivots) @ rows
         return left
 
     def draw(self, rng_key: jax.Array, unknowns: jax.Array, means: Means) -> dict[str, jax.Array]:
         """Return data without noise that might have come: ``means`` plus a draw of the errors."""
         flat, unravel = ravel_pytree(dict(means))
-        modes = self._modes(unknowns, flat)
-        keys = jax.random.split(rng_key, len(modes)) if len(modes) > 1 else [rng_key]
-        for key, V in zip(keys, modes, strict=False):
-            flat += jax.random.normal(key, (len(V),)) @ V
-        return unravel(flat)
+        several = len(self.terms) > 1
+        keys = jax.random.split(rng_key, len(self.terms)) if several else [rng_key]
+        perturbed = flat
+        for key, term in zip(keys, self.terms, strict=False):
+            V = term.at(term.alpha(unknowns), flat)
+            perturbed += jax.random.normal(key, (len(V),)) @ V
+        return unravel(perturbed)
 
     def largest(self, means: Means) -> np.ndarray:
         """Return V (r, d) beside data like ``means``, each size as large as is plausible."""
@@ -256,33 +278,11 @@ class ModelError:
         if others or first.size is not None:
             reasons = (*filter(None, (t.unknown_size for t in self.terms)), _OF_PREDICTION)
             raise InputError(f"what is known of errors: {reasons[0]}")
-        assert first.mixing is not None
-        ((pivots, rows),) = self._eliminated(
-            jnp.zeros(0), {}, ravel_pytree(dict(residual))[0][:, None]
-        )
-        mean = first.mixing.T @ np.asarray(rows[:, 0] / pivots)
-        learned = (first.mixing.T * np.asarray(1.0 - 1.0 / pivots)) @ first.mixing
+        flat = np.asarray(ravel_pytree(dict(residual))[0])
+        pivots = 1.0 + first.strength
+        mean = first.mixing.T @ ((first.weights @ flat) / pivots)
+        learned = (first.mixing.T * (1.0 - 1.0 / pivots)) @ first.mixing
         return mean, np.eye(len(self.names)) - learned
-
-    def _modes(self, unknowns: jax.Array, means: jax.Array) -> list[jax.Array]:
-        """Return V of each term that is diagonal, and of all others together if there are some."""
-        each = [term.at(term.alpha(unknowns), means) for term in self.terms]
-        modes = [V for V, term in zip(each, self.terms, strict=True) if term.strength is not None]
-        others = each[len(modes) :]
-        return [*modes, jnp.concatenate(others)] if others else modes
-
-    def _eliminated(
-        self, unknowns: jax.Array, means: Means, columns: jax.Array
-    ) -> Iterator[tuple[jax.Array, jax.Array]]:
-        """Yield pivots P (r,), and R ``columns`` (r, m) of columns (d, m), group by group."""
-        for term in self.terms:
-            if term.strength is not None:
-                alpha = term.alpha(unknowns)
-                yield 1.0 + alpha**2 * term.strength, alpha * (term.weights @ columns)
-        if any(term.strength is None for term in self.terms):
-            V = self._modes(unknowns, ravel_pytree(dict(means))[0])[-1]
-            VW = times(V, self.information)
-            yield eliminated(VW @ V.T + jnp.eye(len(V)), VW @ columns)
 
     # Files.
 
@@ -293,21 +293,13 @@ class ModelError:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all that changes a likelihood, by its name in a file."""
-        diagonal = [term for term in self.terms if term.strength is not None]
-        arrays: dict[str, Any] = {
-            f"{prefix}{name}": getattr(term, name)
-            for prefix, term in zip(("", _SIZED), diagonal, strict=False)
-            for name in ("weights", "strength", "modes", "mixing")
-        }
+        arrays: dict[str, Any] = {}
+        for term in self.terms:
+            kind, prefix = (_DENSE, _VARYING) if term.strength is None else (_DIAGONAL, _SIZED)
+            prefix = prefix if arrays else ""
+            arrays |= {f"{prefix}{name}": getattr(term, name) for name in kind}
         if isinstance(self.size, Amplitude):
             arrays |= vars(self.size)
-        if others := self.terms[len(diagonal) :]:
-            rows = [(t.modes, t.modes * 0.0 if t.shares is None else t.shares) for t in others]
-            modes, shares = map(np.concatenate, zip(*rows, strict=True))
-            sized = [np.full(len(term.modes), float(term.size is not None)) for term in others]
-            varying = {"modes": modes, "shares": shares, "sized": np.concatenate(sized)}
-            arrays |= {f"{_VARYING}{name}": value for name, value in varying.items()}
-            arrays[f"{_VARYING}information"] = self.information
         if isinstance(self.size, Scale):
             arrays["size_scale"] = self.size.prior_scale
         if self.of_mesh:
@@ -341,30 +333,20 @@ class ModelError:
         for name, array in arrays.items():
             prefix = next((p for p in (_SIZED, _VARYING) if name.startswith(p)), "")
             groups[prefix][name.removeprefix(prefix)] = array
-        first, sized, varying = groups.values()
-        learned = {
-            each.name: first.pop(each.name) for each in fields(Amplitude) if each.name in first
-        }
+        first, *others = groups.values()
         of_mesh, scale = first.pop("of_mesh", None) is not None, first.pop("size_scale", None)
-        more: dict[str, Any] = {"of_fem": of_mesh or not learned}
+        learned = {f.name: first.pop(f.name) for f in fields(Amplitude) if f.name in first}
+        if missing := set(_DIAGONAL[:3]) - set(first):
+            raise TypeError(f"{', '.join(missing)} is missing")
+        size: Amplitude | Scale | None = None
         if learned:
-            more["size"] = Amplitude(**{**learned, "width": float(learned["width"])})
+            size = Amplitude(**{**learned, "width": float(learned["width"])})
         elif scale is not None:
-            more["size"] = inferred_size(words.get("size", ""), float(scale))
-        names = tuple(words.get("names", ()))
-        if not all(
-            {"modes", "weights", "strength"} <= group.keys() for group in (first, sized) if group
-        ):
-            raise TypeError("an array is missing")
-        terms = [Term(**first, **({} if sized or varying else more), names=names)]
-        if sized:
-            terms.append(Term(**sized, **more))
-        if varying:
-            ends = np.flatnonzero(np.diff(varying["sized"])) + 1
-            for rows in np.split(np.arange(len(varying["sized"])), ends):
-                of_size = more if varying["sized"][rows[0]] else {}
-                terms.append(Term(varying["modes"][rows], varying["shares"][rows], **of_size))
-        return cls(tuple(terms), varying.get("information"))
+            size = inferred_size(words.get("size", ""), float(scale))
+        terms = [Term(**group) for group in (first, *others) if group]
+        terms[-1] = replace(terms[-1], size=size, of_fem=of_mesh or not learned)
+        terms[0] = replace(terms[0], names=tuple(words.get("names", ())))
+        return cls(tuple(terms))
 
 
 def inferred_size(name: str, scale: float) -> Scale:
@@ -404,7 +386,7 @@ def check_algebra(
             )
     if len(sizes) > 1:
         raise InputError(
-            f"{what}: {' and '.join(sizes)}; only one size can be unknown, by one name and scale"
+            f"{what}: {' and '.join(sorted(sizes))}; only one size can be unknown, by one name and scale"
         )
 
 
@@ -417,13 +399,27 @@ def marginalised(terms: Sequence[Term], information: np.ndarray) -> ModelError:
     others = [term for term in terms if term.size is not None or term.shares is not None]
     first = _together(constant, information)
     before = () if all(term.is_learned for term in terms) else (first,)
+    if not others:
+        return ModelError(before)
     if all(term.shares is None for term in others):
-        second = [replace(_together(others, information, first), mixing=None)] if others else []
-        return ModelError((*before, *second))
+        second = _together(others, information, first)
+        return ModelError((*before, replace(second, mixing=None)))
     left = information
     if constant:
         left = np.asarray(ModelError(before).information_left(jnp.asarray(left), jnp.zeros(0), {}))
-    return ModelError((*before, *others), left)
+    shares = [np.zeros_like(t.modes) if t.shares is None else t.shares for t in others]
+    sized = [np.full(len(t.modes), float(t.size is not None)) for t in others]
+    together = Term(
+        np.concatenate([term.modes for term in others]),
+        np.concatenate(shares),
+        next((term.size for term in others if term.size is not None), None),
+        np.concatenate(
+            [s if t.sized is None else t.sized for t, s in zip(others, sized, strict=True)]
+        ),
+        information=left,
+        of_fem=all(term.of_fem for term in others),
+    )
+    return ModelError((*before, together))
 
 
 def _together(terms: Sequence[Term], information: np.ndarray, before: Term | None = None) -> Term:

@@ -41,6 +41,7 @@ from calibrate.model_error.marginal import (
     Term,
     check_algebra,
     marginalised,
+    times,
 )
 from calibrate.model_error.systematic import Systematic
 from calibrate.noise import information_about_means
@@ -130,7 +131,7 @@ def _joined(model: Model, what: str, terms: Sequence[Term]) -> ModelError:
 
     :class:`InputError`, which begins with ``what``, where they lack a property that this needs.
     """
-    every = (*model.error.declared, *terms)
+    every = (*model.error.declarations, *terms)
     check_algebra(what, model.noise, {term.unknown_size for term in every} - {""})
     error = marginalised(every, _information(model))
     if taken := error.priors.keys() & replace(model, error=ModelError()).names:
@@ -174,7 +175,7 @@ def with_error(
         raise InputError(f"error of the forward map: {runs} FEM runs; give {FEWEST} or more")
     if simulator.scene.fingerprint != model.forward.scene.fingerprint:
         raise InputError("error of the forward map: the simulator is for another scene")
-    kept = [term for term in model.error.declared if not term.is_learned]
+    kept = [term for term in model.error.declarations if not term.is_learned]
     sizes = {LEARNED, *(term.unknown_size for term in kept)} - {""}
     check_algebra("error of the forward map", model.noise, sizes)
     predict = jax.jit(model.predict)
@@ -333,26 +334,18 @@ def fit(
     information : the information W of the noise about its mean, (d, d), or its diagonal (d,).
     of_mesh : whether FEM was run on a finer mesh.
     """
-    if information.ndim == 1:
-        information = np.diag(information)
-    root = np.linalg.cholesky(information)  # W = root root^T
     centre, scale = unknowns.mean(axis=0), np.maximum(unknowns.std(axis=0), 1e-12)
-    x, whitened = (unknowns - centre) / scale, errors @ root
-    norms = np.linalg.norm(whitened, axis=1)
+    x = (unknowns - centre) / scale
+    norms = np.sqrt(np.sum(times(errors, information) * errors, axis=1))
     log_sizes = np.log(np.maximum(norms, 1e-12 * max(float(norms.max()), 1e-300)))
     width = min(
         _WIDTHS, key=lambda w: float(np.mean((_left_out(x, log_sizes, w) - log_sizes) ** 2))
     )
-    shapes = whitened / np.exp(_left_out(x, log_sizes, width))[:, None]
-    _, singular, right = np.linalg.svd(shapes / np.sqrt(len(shapes)), full_matrices=False)
-    used = np.arange(len(singular)) < _MODES
-    used &= singular > 1e-6 * max(float(singular[0]), 1e-300)
-    rows = singular[used, None] * right[used]  # A root, orthogonal
-    return Term(
-        modes=np.linalg.solve(root.T, rows.T).T,
-        size=Amplitude(x, log_sizes, float(width), centre, scale),
-        of_fem=of_mesh,
-    )
+    sizes = np.exp(_left_out(x, log_sizes, width))[:, None]
+    size = Amplitude(x, log_sizes, float(width), centre, scale)
+    (term,) = marginalised([Term(errors / sizes / np.sqrt(len(x)), size=size)], information).terms
+    largest = np.argsort(-term.strength)[:_MODES]
+    return Term(term.modes[largest], size=size, of_fem=of_mesh)
 
 
 def _left_out(x: np.ndarray, values: np.ndarray, width: float) -> np.ndarray:

@@ -32,6 +32,7 @@ CURVE = replace(SIZED, shares=0.3 * RNG.normal(size=(4, 6)))
 SIZE = Amplitude(RNG.normal(size=(9, 1)), RNG.normal(size=9), 0.3, np.array([7.1]), np.array([0.5]))
 OF_MAP = Term(RNG.normal(size=(2, 6)), size=SIZE, of_fem=False)
 OF_MESH = replace(OF_MAP, of_fem=True)
+SIZES = (0.4, 0.4, 1.0, 0.4)  # of CURVE in rows of which the third has a known size
 LISTS = {
     "known": [KNOWN],
     "shares": [GAIN],
@@ -93,7 +94,7 @@ def test_the_ratio_and_the_information_are_those_of_dense_covariances(terms, inf
 @pytest.mark.parametrize("terms", LISTS.values(), ids=LISTS)
 def test_terms_that_were_integrated_out_may_be_so_again(terms, information):
     once = marginalised(terms, information)
-    again = marginalised(once.declared, information)
+    again = marginalised(once.declarations, information)
     found, wanted = (e.log_ratio(unknowns(terms), RESIDUAL, MEANS) for e in (again, once))
     assert float(found) == pytest.approx(float(wanted), rel=1e-9)
 
@@ -137,12 +138,14 @@ def test_arrays_have_the_names_that_saved_errors_have():
     assert names(OF_MESH) == [*diagonal, *of_size, "of_mesh"]
     # Rows of an inferred size may be between others.
     arrays = marginalised([GAIN, CURVE], W).arrays() | {
-        "varying_sized": np.array([0, 1, 1, 0, 1.0])
+        "varying_sized": np.array([0.0, 1, 1, 0, 1])
     }
     words = marginalised([CURVE], W).words
     back = ModelError.restore(arrays, words)
-    assert [len(term.modes) for term in back.terms[1:]] == [1, 2, 1, 1]
-    np.testing.assert_array_equal(back.arrays()["varying_sized"], arrays["varying_sized"])
+    V = back.terms[1].at(0.4, jnp.asarray(FLAT))
+    kept = [GAIN.at(1.0, FLAT), *(size * CURVE.at(1.0, FLAT)[k] for k, size in enumerate(SIZES))]
+    np.testing.assert_allclose(V, np.vstack(kept))
+    assert back.fingerprint == ModelError.restore(back.arrays(), words).fingerprint
 
 
 @pytest.mark.parametrize("name", ["known and sized", "all of a measurement", "shares and map"])
