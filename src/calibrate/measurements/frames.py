@@ -28,7 +28,7 @@ from calibrate.state_names import in_state, split
 from emulator.core.errors import InputError
 from emulator.geometry.facets import MM3_PER_ML, enclosed_volume, encloses, openings, rim
 from emulator.geometry.mesh import Mesh
-from emulator.geometry.surfaces import Surface
+from emulator.hearts.surfaces import Surface
 from emulator.scenes.scene import Scene, cavity_sets
 
 POINTS = 60

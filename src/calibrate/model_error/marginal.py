@@ -385,9 +385,8 @@ def check_algebra(
                 "inferred"
             )
     if len(sizes) > 1:
-        raise InputError(
-            f"{what}: {' and '.join(sorted(sizes))}; only one size can be unknown, by one name and scale"
-        )
+        reasons = " and ".join(sorted(sizes))
+        raise InputError(f"{what}: {reasons}; only one size can be unknown, by one name and scale")
 
 
 def marginalised(terms: Sequence[Term], information: np.ndarray) -> ModelError:

@@ -62,7 +62,7 @@ def frames(arguments: Namespace) -> Answer:
     from calibrate.measurements.frames import frame_data
     from calibrate.state_names import states_of
     from emulator.core.errors import look_up
-    from emulator.geometry.surfaces import UNITS, read_surface
+    from emulator.hearts.surfaces import UNITS, read_surface
 
     check_folder(Path(arguments.out).parent)
     if bool(arguments.field) is bool(arguments.surface):
