@@ -77,7 +77,8 @@ from jax.scipy.special import logsumexp
 
 from calibrate.analysis.identifiability import combinations, prior_table
 from calibrate.measurements import Observation, Observations
-from calibrate.model_error.marginal import Means, ModelError, check_algebra, times
+from calibrate.model_error.algebra import check_algebra
+from calibrate.model_error.marginal import Means, ModelError, times
 from calibrate.noise import Noise, information_about_means
 from calibrate.posterior import Posterior
 from calibrate.statistical_model import Model

@@ -18,7 +18,7 @@ from jax.flatten_util import ravel_pytree
 from scipy.special import bdtr
 
 from calibrate.analysis.term_sets import PRESENT, posterior_of_sets, seen_columns
-from calibrate.model_error.marginal import check_algebra
+from calibrate.model_error.algebra import check_algebra
 from calibrate.noise import information_about_means
 from calibrate.statistical_model.model import Model
 from emulator.core.display import TableRepr

@@ -24,14 +24,9 @@ likelihood of the residual r = y - g changes by
 
 .. math:: W - R^T P^{-1} R
 
-is left. Terms are joined to two, the second eliminated beside the information that the first
-leaves. The first are those of size 1 without shares, which leave the same for all x. Where the
-others have no shares, all their modes have one size, so that in both modes can be chosen, once, for
-which :math:`G = A W A^T` is diagonal: then L = I, :math:`P = I + \alpha^2 G`, and a likelihood of d
-numbers costs one product with the modes. Where one has shares, the second is eliminated anew for
-each x.
-
-Which terms and noises can be together follows from this algebra (:func:`check_algebra`).
+is left. Where B = 0, modes are chosen, once, for which :math:`G = A W A^T` is diagonal: then L = I,
+:math:`P = I + \alpha^2 G`, and a likelihood of d numbers costs one product with the modes. Others
+are eliminated anew for each x (:mod:`calibrate.model_error.algebra`).
 
 Shares are of the prediction g and not of the data y: the noise of the data would be scaled in the
 modes, too, so that smaller predictions would err less, and a scale of n numbers with share s would
@@ -40,7 +35,7 @@ be fitted too low by the factor :math:`1 + (n - 1) s^2` (Peelle's puzzle; D'Agos
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -50,7 +45,7 @@ import numpy as np
 import numpyro.distributions as dist
 from jax.flatten_util import ravel_pytree
 
-from calibrate.noise.protocol import Noise, Scale
+from calibrate.noise.protocol import Scale
 from emulator.core.errors import InputError
 from emulator.core.gaussian_process import eliminated
 from emulator.surrogates.protocol import fingerprint_of
@@ -66,7 +61,6 @@ _DIAGONAL = ("weights", "strength", "modes", "mixing")  # arrays of a term that 
 _DENSE = ("modes", "shares", "sized", "information")  # of one that is not
 # Recorded in saved errors, because in earlier versions shares were of the data.
 _SHARES = "of the prediction"
-_OF_PREDICTION = "some are shares of what is predicted"
 
 
 @jax.tree_util.register_dataclass
@@ -116,7 +110,7 @@ class Term:
         modes that no datum could tell from nothing; ``None`` where the declared ones are forgotten.
     information : W, (d, d), or its diagonal (d,), where they are not.
     names : names of the unknowns z of the declared modes of a systematic error.
-    of_fem : whether data differ from FEM on the map's mesh by the modes of this size, too.
+    of_mesh : whether modes of a learned size were learned on a finer mesh.
     """
 
     modes: np.ndarray
@@ -128,7 +122,7 @@ class Term:
     mixing: Any = None
     information: np.ndarray | None = None
     names: tuple[str, ...] = jax.tree.static(default=())
-    of_fem: bool = jax.tree.static(default=True)
+    of_mesh: bool = jax.tree.static(default=False)
 
     @property
     def is_learned(self) -> bool:
@@ -170,7 +164,7 @@ class Term:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class ModelError:
-    """All errors of a model's data besides its noise, as :func:`marginalised` makes them.
+    """All errors of a model's data besides its noise.
 
     terms : the terms in the order in which they are eliminated.
     """
@@ -186,24 +180,29 @@ class ModelError:
         )
 
     @property
+    def systematic(self) -> ModelError:
+        """The errors that are not learned from FEM runs."""
+        terms = [term for term in self.terms if not term.is_learned]
+        for term in self.terms:
+            if term.is_learned and term.sized is not None:
+                rows = {n: getattr(term, n)[term.sized == 0.0] for n in _DENSE[:3]}
+                terms.append(replace(term, **rows, size=None))
+        return ModelError(tuple(terms))
+
+    @property
     def of_fem(self) -> ModelError:
         """The errors by which data differ from FEM on the map's mesh, too."""
-        terms = [term for term in self.terms if term.of_fem]
-        for term in self.terms:
-            if not term.of_fem and term.sized is not None:
-                rows = {n: getattr(term, n)[term.sized == 0.0] for n in _DENSE[:3]}
-                terms.append(replace(term, **rows, size=None, of_fem=True))
-        return ModelError(tuple(terms))
+        return self if self.of_mesh else self.systematic
 
     @property
     def is_learned(self) -> bool:
         """Whether errors of the forward map, learned from FEM runs, are among them."""
-        return any(term.is_learned for term in self.terms)
+        return isinstance(self.size, Amplitude)
 
     @property
     def of_mesh(self) -> bool:
         """Whether errors were learned on a finer mesh, so that they are the mesh's as well."""
-        return self.of_fem.is_learned
+        return any(term.is_learned and term.of_mesh for term in self.terms)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -276,15 +275,13 @@ class ModelError:
         """
         first, *others = self.terms
         if others or first.size is not None:
-            reasons = (*filter(None, (t.unknown_size for t in self.terms)), _OF_PREDICTION)
-            raise InputError(f"what is known of errors: {reasons[0]}")
+            reason = self.terms[-1].unknown_size or "some are shares of what is predicted"
+            raise InputError(f"what is known of errors: {reason}")
         flat = np.asarray(ravel_pytree(dict(residual))[0])
         pivots = 1.0 + first.strength
         mean = first.mixing.T @ ((first.weights @ flat) / pivots)
         learned = (first.mixing.T * (1.0 - 1.0 / pivots)) @ first.mixing
         return mean, np.eye(len(self.names)) - learned
-
-    # Files.
 
     @property
     def fingerprint(self) -> str:
@@ -338,13 +335,11 @@ class ModelError:
         learned = {f.name: first.pop(f.name) for f in fields(Amplitude) if f.name in first}
         if missing := set(_DIAGONAL[:3]) - set(first):
             raise TypeError(f"{', '.join(missing)} is missing")
-        size: Amplitude | Scale | None = None
+        size: Any = None if scale is None else inferred_size(words.get("size", ""), float(scale))
         if learned:
             size = Amplitude(**{**learned, "width": float(learned["width"])})
-        elif scale is not None:
-            size = inferred_size(words.get("size", ""), float(scale))
         terms = [Term(**group) for group in (first, *others) if group]
-        terms[-1] = replace(terms[-1], size=size, of_fem=of_mesh or not learned)
+        terms[-1] = replace(terms[-1], size=size, of_mesh=of_mesh)
         terms[0] = replace(terms[0], names=tuple(words.get("names", ())))
         return cls(tuple(terms))
 
@@ -357,88 +352,3 @@ def inferred_size(name: str, scale: float) -> Scale:
 def times(rows: Any, information: Any) -> Any:
     """Return V W (r, d) of rows V (r, d) and an information (d, d), or its diagonal (d,)."""
     return rows * information if information.ndim == 1 else rows @ information
-
-
-def check_algebra(
-    what: str,
-    noise: Mapping[str, Noise],
-    sizes: Collection[str] = (),
-    *,
-    gaussian: bool = True,
-    known: bool = True,
-) -> None:
-    """Raise :class:`InputError` unless noise and errors have the properties that algebra needs.
-
-    Terms are integrated out beside Gaussian noise, whose information does not change with the
-    unknowns; and modes are made diagonal for one size.
-
-    what : the beginning of the message.
-    sizes : the different sizes that are not known, as of :attr:`Term.unknown_size`.
-    gaussian, known : whether the noise has to be Gaussian, and its sd known.
-    """
-    for name, each in noise.items():
-        if gaussian and not each.gaussian:
-            raise InputError(f"{what}: the noise of {name} must be Gaussian; it is {each.kind}")
-        if known and each.priors:
-            raise InputError(
-                f"{what}: the noise of {name} must be of known sd; {', '.join(each.priors)} is "
-                "inferred"
-            )
-    if len(sizes) > 1:
-        reasons = " and ".join(sorted(sizes))
-        raise InputError(f"{what}: {reasons}; only one size can be unknown, by one name and scale")
-
-
-def marginalised(terms: Sequence[Term], information: np.ndarray) -> ModelError:
-    """Return ``terms`` together, integrated out; at most one of their sizes is not known.
-
-    information : information W of the noise about the data's means, (d, d), or its diagonal (d,).
-    """
-    constant = [term for term in terms if term.size is None and term.shares is None]
-    others = [term for term in terms if term.size is not None or term.shares is not None]
-    first = _together(constant, information)
-    before = () if all(term.is_learned for term in terms) else (first,)
-    if not others:
-        return ModelError(before)
-    if all(term.shares is None for term in others):
-        second = _together(others, information, first)
-        return ModelError((*before, replace(second, mixing=None)))
-    left = information
-    if constant:
-        left = np.asarray(ModelError(before).information_left(jnp.asarray(left), jnp.zeros(0), {}))
-    shares = [np.zeros_like(t.modes) if t.shares is None else t.shares for t in others]
-    sized = [np.full(len(t.modes), float(t.size is not None)) for t in others]
-    together = Term(
-        np.concatenate([term.modes for term in others]),
-        np.concatenate(shares),
-        next((term.size for term in others if term.size is not None), None),
-        np.concatenate(
-            [s if t.sized is None else t.sized for t, s in zip(others, sized, strict=True)]
-        ),
-        information=left,
-        of_fem=all(term.of_fem for term in others),
-    )
-    return ModelError((*before, together))
-
-
-def _together(terms: Sequence[Term], information: np.ndarray, before: Term | None = None) -> Term:
-    """Return terms of one size without shares as one, its modes chosen such that G is diagonal.
-
-    information : information W of the noise, of which ``before`` leaves a part.
-    """
-    modes = np.concatenate([np.zeros((0, len(information))), *(term.modes for term in terms)])
-    weighted = times(modes, information)
-    if before is not None:
-        between = (weighted @ before.modes.T) / (1.0 + before.strength)
-        weighted = weighted - between @ before.weights
-    strength, mixing = np.linalg.eigh(weighted @ modes.T)
-    visible = strength > 1e-12 * max(float(strength.max(initial=0.0)), 1e-300)
-    rows = mixing[:, visible].T
-    return replace(
-        terms[0] if terms else Term(modes),
-        modes=rows @ modes,
-        weights=rows @ weighted,
-        strength=strength[visible],
-        mixing=rows,
-        names=tuple(name for term in terms for name in term.names),
-    )

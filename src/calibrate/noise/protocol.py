@@ -61,8 +61,8 @@ class Scale:
         if (self.known is None) == (self.prior_scale is None):
             first, second = self.options
             raise InputError(f"give either {first} (known) or {second} (of its prior)")
-        given = self.prior_scale if self.known is None else self.known
-        check_positive("standard deviation", given)
+        value = self.prior_scale if self.known is None else self.known
+        check_positive("standard deviation", value)
 
     @property
     def priors(self) -> dict[str, dist.Distribution]:

@@ -33,16 +33,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from calibrate.model_error.algebra import check_algebra, marginalised
 from calibrate.model_error.kinds import Measurement, read_systematic
-from calibrate.model_error.marginal import (
-    LEARNED,
-    Amplitude,
-    ModelError,
-    Term,
-    check_algebra,
-    marginalised,
-    times,
-)
+from calibrate.model_error.marginal import LEARNED, Amplitude, ModelError, Term, times
 from calibrate.model_error.systematic import Systematic
 from calibrate.noise import information_about_means
 from calibrate.statistical_model.fem_likelihood import FEMLikelihood
@@ -175,8 +168,8 @@ def with_error(
         raise InputError(f"error of the forward map: {runs} FEM runs; give {FEWEST} or more")
     if simulator.scene.fingerprint != model.forward.scene.fingerprint:
         raise InputError("error of the forward map: the simulator is for another scene")
-    kept = [term for term in model.error.declarations if not term.is_learned]
-    sizes = {LEARNED, *(term.unknown_size for term in kept)} - {""}
+    systematic = model.error.systematic.declarations
+    sizes = {LEARNED, *(term.unknown_size for term in systematic)} - {""}
     check_algebra("error of the forward map", model.noise, sizes)
     predict = jax.jit(model.predict)
     fem = FEMLikelihood(model, simulator)
@@ -213,7 +206,7 @@ def with_error(
         )
     information = _information(model)
     term = fit(np.array(unknowns), np.array(errors), information, of_mesh=of_mesh)
-    return replace(model, error=marginalised([*kept, term], information))
+    return replace(model, error=marginalised([*systematic, term], information))
 
 
 class MapErrors(NamedTuple):
@@ -345,7 +338,7 @@ def fit(
     size = Amplitude(x, log_sizes, float(width), centre, scale)
     (term,) = marginalised([Term(errors / sizes / np.sqrt(len(x)), size=size)], information).terms
     largest = np.argsort(-term.strength)[:_MODES]
-    return Term(term.modes[largest], size=size, of_fem=of_mesh)
+    return Term(term.modes[largest], size=size, of_mesh=of_mesh)
 
 
 def _left_out(x: np.ndarray, values: np.ndarray, width: float) -> np.ndarray:

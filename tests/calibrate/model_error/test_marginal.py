@@ -9,15 +9,8 @@ import pytest
 from scipy.stats import multivariate_normal
 
 import calibrate as cal
-from calibrate.model_error.marginal import (
-    LEARNED,
-    Amplitude,
-    ModelError,
-    Term,
-    check_algebra,
-    inferred_size,
-    marginalised,
-)
+from calibrate.model_error.algebra import check_algebra, marginalised
+from calibrate.model_error.marginal import LEARNED, Amplitude, ModelError, Term, inferred_size
 from emulator.core.errors import InputError
 
 MEANS = {"a": jnp.array([1.0, -2.0]), "b": jnp.array([[3.0, 0.5], [1.5, -1.0]])}
@@ -30,8 +23,8 @@ GAIN = Term(RNG.normal(size=(1, 6)), 0.3 * RNG.normal(size=(1, 6)), names=("gain
 SIZED = Term(RNG.normal(size=(4, 6)), size=inferred_size("size", 0.5), names=tuple("abcd"))
 CURVE = replace(SIZED, shares=0.3 * RNG.normal(size=(4, 6)))
 SIZE = Amplitude(RNG.normal(size=(9, 1)), RNG.normal(size=9), 0.3, np.array([7.1]), np.array([0.5]))
-OF_MAP = Term(RNG.normal(size=(2, 6)), size=SIZE, of_fem=False)
-OF_MESH = replace(OF_MAP, of_fem=True)
+OF_MAP = Term(RNG.normal(size=(2, 6)), size=SIZE)
+OF_MESH = replace(OF_MAP, of_mesh=True)
 SIZES = (0.4, 0.4, 1.0, 0.4)  # of CURVE in rows of which the third has a known size
 LISTS = {
     "known": [KNOWN],
@@ -45,6 +38,7 @@ LISTS = {
     "mesh": [OF_MESH],
     "known and map": [KNOWN, OF_MAP],
     "shares and map": [KNOWN, GAIN, OF_MAP],
+    "shares and mesh": [OF_MESH, GAIN],
 }
 
 
@@ -81,8 +75,9 @@ def unknowns(terms, size=X[1]):
 @pytest.mark.parametrize("size", [0.0, 0.4, 2.0])
 def test_the_ratio_and_the_information_are_those_of_dense_covariances(terms, information, size):
     error, C = marginalised(terms, information), np.linalg.inv(whole(information))
-    of_fem = [term for term in terms if term.of_fem]
-    for those, part in ((terms, error), (of_fem, error.of_fem)):
+    systematic = [term for term in terms if not term.is_learned]
+    of_fem = terms if OF_MESH in terms else systematic
+    for those, part in ((terms, error), (of_fem, error.of_fem), (systematic, error.systematic)):
         S, at = C + dense(those, (X[0], size)), unknowns(terms, size)
         wanted = [multivariate_normal(np.zeros(6), each).logpdf(R) for each in (S, C)]
         found = float(part.log_ratio(at, RESIDUAL, MEANS))

@@ -13,7 +13,7 @@ from scipy.stats import multivariate_normal
 import calibrate as cal
 import emulator as em
 from calibrate.model_error import ModelError, Systematic
-from calibrate.model_error.marginal import marginalised
+from calibrate.model_error.algebra import marginalised
 from calibrate.posterior import sample
 from calibrate.posterior.diagnosis import map_fault
 from calibrate.statistical_model import with_error
@@ -88,7 +88,7 @@ def test_fem_on_the_mesh_shares_the_error_of_the_mesh_only(aware, truth):
     size = float(aware.error.size(jnp.array([70.0, 81.0])))
     of_noise = NOISE**2 * np.eye(aware.error.terms[0].modes.shape[1])
     of_mesh = size**2 * aware.error.terms[0].modes.T @ aware.error.terms[0].modes
-    whole = replace(aware, error=ModelError((replace(aware.error.terms[0], of_fem=True),)))
+    whole = replace(aware, error=ModelError((replace(aware.error.terms[0], of_mesh=True),)))
     mean, y = (np.ravel(d["displacement"]) for d in (means, data))
     for model, covariance in ((aware, of_noise), (whole, of_noise + of_mesh)):
         found = float(model.fem_log_likelihood(draw, means, data))
@@ -160,6 +160,16 @@ def test_it_is_beside_systematic_errors(truth, poor):
     )
     assert not back.of_mesh
     assert len(back.of_fem.terms) == 1
+    gain = Systematic(("gain",), {}, shares={"displacement": np.full((1, 4, 3), 0.1)})
+    with_gain = with_error(cal.with_systematic(told, gain), LinearSimulator(truth), 40)
+    of_gain = 0.01 * np.outer(mean, mean)
+    for model in (with_gain, with_error(with_gain, LinearSimulator(truth), 40)):
+        found = float(model.map_log_likelihood(draw, data))
+        wanted_too = multivariate_normal(mean, of_map + of_gain).logpdf(y)
+        assert found == pytest.approx(wanted_too, rel=1e-9)
+        by_fem = float(model.fem_log_likelihood(draw, means, data))
+        wanted_too = multivariate_normal(mean, of_fem + of_gain).logpdf(y)
+        assert by_fem == pytest.approx(wanted_too, rel=1e-9)
     # A second error of the map takes the place of the first; one of unknown size has no place.
     again = with_error(whole, LinearSimulator(truth), 40)
     assert float(again.map_log_likelihood(draw, data)) == pytest.approx(wanted[0], rel=1e-9)
