@@ -305,10 +305,9 @@ def _stacked(arrays: Sequence[Any]) -> np.ndarray:
 
 def sizes_of(error: ModelError, count: int = _SIZES) -> jax.Array:
     """Return equally probable sizes (count, 1) of the error; (count, 0) if its size is known."""
-    priors = list(error.priors.values())
-    if not priors:
+    prior = next(iter(error.priors.values()), None)
+    if prior is None:
         return jnp.zeros((count, 0))
-    (prior,) = priors
     return prior.icdf((jnp.arange(count) + 0.5) / count)[:, None]
 
 

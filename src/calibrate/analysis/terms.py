@@ -182,9 +182,7 @@ def _whitening(model: Model) -> np.ndarray:
     }
     means = {name: jnp.zeros(part.shape) for name, part in model.observe.parts.items()}
     information = np.asarray(information_about_means(model.noise, means, scales))
-    if information.ndim == 1:
-        return np.diag(np.sqrt(information))
-    return np.linalg.cholesky(information).T
+    return np.linalg.cholesky(np.diag(information) if information.ndim == 1 else information).T
 
 
 def _design(model: Model) -> np.ndarray:

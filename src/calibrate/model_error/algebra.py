@@ -69,15 +69,14 @@ def marginalised(terms: Sequence[Term], information: np.ndarray) -> ModelError:
     left = information
     if constant:
         left = np.asarray(ModelError(before).information_left(jnp.asarray(left), jnp.zeros(0), {}))
-    shares = [np.zeros_like(t.modes) if t.shares is None else t.shares for t in others]
-    sized = [np.full(len(t.modes), float(t.size is not None)) for t in others]
+    sized = [
+        np.full(len(t.modes), t.size is not None) if t.sized is None else t.sized for t in others
+    ]
     together = Term(
         np.concatenate([term.modes for term in others]),
-        np.concatenate(shares),
+        np.concatenate([0.0 * t.modes if t.shares is None else t.shares for t in others]),
         next((term.size for term in others if term.size is not None), None),
-        np.concatenate(
-            [s if t.sized is None else t.sized for t, s in zip(others, sized, strict=True)]
-        ),
+        1.0 * np.concatenate(sized),
         information=left,
         of_mesh=any(term.of_mesh for term in others),
     )

@@ -77,12 +77,10 @@ class Measurement:
         """Return ``error`` in the entries that are not missing."""
 
         def reduced(modes: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-            entries = {name: self.observe.parts[name].entries for name in modes}
+            entries = {n: self.observe.parts[n].entries for n in modes}
             return {
-                name: each
-                if entries[name] is None
-                else each.reshape(len(each), -1)[:, entries[name]]
-                for name, each in modes.items()
+                n: V if entries[n] is None else V.reshape(len(V), -1)[:, entries[n]]
+                for n, V in modes.items()
             }
 
         return replace(error, modes=reduced(error.modes), shares=reduced(error.shares))

@@ -251,8 +251,7 @@ class ModelError:
     def draw(self, rng_key: jax.Array, unknowns: jax.Array, means: Means) -> dict[str, jax.Array]:
         """Return data without noise that might have come: ``means`` plus a draw of the errors."""
         flat, unravel = ravel_pytree(dict(means))
-        several = len(self.terms) > 1
-        keys = jax.random.split(rng_key, len(self.terms)) if several else [rng_key]
+        keys = jax.random.split(rng_key, len(self.terms)) if self.terms[1:] else [rng_key]
         perturbed = flat
         for key, term in zip(keys, self.terms, strict=False):
             V = term.at(term.alpha(unknowns), flat)
@@ -295,12 +294,9 @@ class ModelError:
             kind, prefix = (_DENSE, _VARYING) if term.strength is None else (_DIAGONAL, _SIZED)
             prefix = prefix if arrays else ""
             arrays |= {f"{prefix}{name}": getattr(term, name) for name in kind}
-        if isinstance(self.size, Amplitude):
-            arrays |= vars(self.size)
-        if isinstance(self.size, Scale):
-            arrays["size_scale"] = self.size.prior_scale
-        if self.of_mesh:
-            arrays["of_mesh"] = True
+        arrays |= vars(self.size) if isinstance(self.size, Amplitude) else {}
+        arrays["size_scale"] = getattr(self.size, "prior_scale", None)
+        arrays["of_mesh"] = self.of_mesh or None
         return {name: np.asarray(value) for name, value in arrays.items() if value is not None}
 
     @property

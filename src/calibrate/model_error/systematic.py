@@ -77,9 +77,10 @@ class Systematic:
                 )
 
         def rows(modes: Mapping[str, np.ndarray]) -> np.ndarray:
-            s = len(self.names)
-            every = {name: np.zeros((s, *shape)) for name, shape in shapes.items()} | dict(modes)
-            return np.hstack([np.reshape(part, (s, -1)) for part in jax.tree.leaves(every)])
+            every = {name: np.zeros((len(self.names), *shapes[name])) for name in shapes} | dict(
+                modes
+            )
+            return np.hstack([np.reshape(V, (len(V), -1)) for V in jax.tree.leaves(every)])
 
         shares = rows(self.shares)
         return Term(

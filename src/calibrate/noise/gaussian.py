@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
 
@@ -41,10 +40,6 @@ class GaussianNoise(Noise):
     def distribution(self, mean: jax.Array, values: Mapping[str, jax.Array]) -> dist.Distribution:
         """Return independent normal distributions around ``mean``."""
         return dist.Normal(mean, self.scales[0].value(values)).to_event(mean.ndim)
-
-    def information(self, mean: jax.Array, values: Mapping[str, jax.Array]) -> jax.Array:
-        r"""Return :math:`1 / \sigma^2` for each number (d,)."""
-        return jnp.full(mean.size, 1.0 / jnp.square(self.scales[0].value(values)))
 
     def simulate(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
         """Return noise of data of this shape; :class:`InputError` where the sd is not known."""

@@ -142,13 +142,14 @@ class Noise(ABC):
         ``values`` are the inferred scales by name.
         """
 
-    @abstractmethod
     def information(self, mean: jax.Array, values: Mapping[str, jax.Array]) -> jax.Array:
         """Return the information of data of d numbers about their ``mean``.
 
         It is the curvature of the log density at the mean: its diagonal (d,) where the numbers are
         independent, (d, d) otherwise. ``values`` are the inferred scales by name.
         """
+        of_one = jax.hessian(lambda m: self.distribution(m, values).log_prob(jnp.zeros(())))
+        return jnp.full(mean.size, -of_one(jnp.zeros(())))
 
     @abstractmethod
     def simulate(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:

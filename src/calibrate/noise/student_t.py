@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
 
@@ -67,11 +66,6 @@ class StudentTNoise(Noise):
     def distribution(self, mean: jax.Array, values: Mapping[str, jax.Array]) -> dist.Distribution:
         """Return independent Student-t distributions around ``mean``."""
         return dist.StudentT(self.dof, mean, self.scales[0].value(values)).to_event(mean.ndim)
-
-    def information(self, mean: jax.Array, values: Mapping[str, jax.Array]) -> jax.Array:
-        r"""Return :math:`(\nu + 1) / (\nu s^2)` for each number (d,)."""
-        scale = self.scales[0].value(values)
-        return jnp.full(mean.size, (self.dof + 1.0) / (self.dof * jnp.square(scale)))
 
     def simulate(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
         """Return noise of data of this shape; :class:`InputError` where the scale is not known."""
