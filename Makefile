@@ -14,14 +14,21 @@ OLDEST_TESTS := tests/test_package.py $(addprefix tests/emulator/,mechanics scen
 	training core/test_schema.py core/test_store.py) $(addprefix tests/calibrate/,samplers certificate cli/test_cli.py \
 	analysis/test_sensitivity.py report posterior/test_tree.py measurements/test_data.py project/test_demo.py)
 
-.PHONY: demo test test-slow test-studies test-oldest package notebooks pictures docs lint format study clean
+.PHONY: demo test nightly test-slow test-studies test-oldest package notebooks pictures docs lint format study clean
 
 demo: $(STAMP)
 	@$(BIN)/calibrate demo --out $(OUT)
 
-# Programs run once or twice here, so the compiler's expensive passes cost more than they save.
+# Programs run once or twice here, so the compiler's expensive passes cost more than they save. Some
+# tests of the solver run with what users compile.
 test: $(STAMP)
-	JAX_DISABLE_MOST_OPTIMIZATIONS=1 $(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile --durations=20
+	JAX_DISABLE_MOST_OPTIMIZATIONS=1 $(BIN)/python -m pytest -m "not slow and not optimised" -n 2 \
+		--dist loadfile --durations=20
+	$(BIN)/python -m pytest -m "optimised and not slow" -n 2 --dist loadfile tests/emulator/fem
+
+# Every tier, one after the other; docs/testing.md gets a table of how each ended.
+nightly: $(STAMP)
+	$(BIN)/python tests/nightly.py
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow -n 2 --dist loadfile --durations=20 \

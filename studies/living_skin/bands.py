@@ -1,8 +1,8 @@
 r"""Bands of points and of the force at motions of the pad beyond the data, and how many they hold.
 
 What the model misses of a displacement at the point X and the motion a, the error of the model
-``e(X, a)`` of :class:`calibrate.model_error.kinds.Field`, is known in the frames that are data, so
-that at another motion it is a conditioned Gaussian field,
+``e(X, a)`` of :class:`calibrate.model_error.kinds.FieldError`, is known in the frames that are
+data, so that at another motion it is a conditioned Gaussian field,
 
 .. math:: e(a^*) \mid r \sim N\left(c^T C^{-1} r,\; v - c^T C^{-1} c\right),
 

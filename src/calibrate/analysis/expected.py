@@ -77,7 +77,8 @@ from jax.scipy.special import logsumexp
 
 from calibrate.analysis.identifiability import combinations, prior_table
 from calibrate.measurements import Observation, Observations
-from calibrate.model_error.marginal import Means, ModelError
+from calibrate.model_error.algebra import check_algebra
+from calibrate.model_error.marginal import Means, ModelError, times
 from calibrate.noise import Noise, information_about_means
 from calibrate.posterior import Posterior
 from calibrate.statistical_model import Model
@@ -96,9 +97,9 @@ _SIZES = 32  # values of an inferred size, equally probable
 _WIDER = 1.3  # factor by which Student's t is wider than the estimated covariance
 
 
-At = Callable[[jax.Array, ModelError | None, jax.Array], jax.Array]
-"""The function of x (q,), the shared errors (or ``None``) and their unknowns (m,) that returns the
-information F (q, q)."""
+At = Callable[[jax.Array, ModelError, jax.Array], jax.Array]
+"""The function of x (q,), the shared errors and their unknowns (m,) that returns the information F
+(q, q)."""
 
 
 def information_at(model: Model, observe: Observations, noise: Mapping[str, Noise]) -> At:
@@ -109,8 +110,9 @@ def information_at(model: Model, observe: Observations, noise: Mapping[str, Nois
     Raises
     ------
     InputError
-        A load state that the model does not have.
+        A load state that the model does not have, or noise whose sd is inferred.
     """
+    check_algebra("identifiability", noise, gaussian=False)
     names, known = model.states.unknowns, model.states.states
     for state in observe.states:
         if state not in known:
@@ -124,13 +126,11 @@ def information_at(model: Model, observe: Observations, noise: Mapping[str, Nois
         means, _ = predicted(thetas)
         return ravel_pytree(means)[0], means
 
-    def at(x: jax.Array, error: ModelError | None, sizes: jax.Array) -> jax.Array:
+    def at(x: jax.Array, error: ModelError, sizes: jax.Array) -> jax.Array:
         J, means = jax.jacfwd(data, has_aux=True)(x)
+        unknowns = jnp.concatenate([model.from_scales(x), sizes])
         about_means = information_about_means(noise, means)
-        if error is not None:
-            unknowns = jnp.concatenate([model.from_scales(x), sizes])
-            about_means = error.information_left(about_means, unknowns, means)
-        return J.T @ about_means @ J
+        return times(J.T, error.information_left(about_means, unknowns, means)) @ J
 
     return at
 
@@ -166,10 +166,6 @@ def expected_precision(
         The forward map has no answer at any of the draws, noise has no known sd, or an error that
         does not fit.
     """
-    if any(model.noise_sites.values()):
-        raise InputError(
-            "identifiability: give every noise a known sd, as in GaussianNoise(sd=...)"
-        )
     errors: Errors = errors_of_data(model, systematic) if systematic else lambda _: model.error
     names, table = model.states.unknowns, prior_table(model)
     mean, prior = table.mean(axis=0), np.asarray(model.on_scales(table))
@@ -208,12 +204,11 @@ def _posterior_covariances(
     def predicted(x: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
         return model.predict(values(x))
 
-    def log_likelihood(x: jax.Array, answer: Any, data: Any, error: ModelError | None) -> jax.Array:
+    def log_likelihood(x: jax.Array, answer: Any, data: Any, error: ModelError) -> jax.Array:
         means, valid = answer
+        residual = {name: data[name] - mean for name, mean in means.items()}
         log_density = model.log_density({}, means, data)
-        if error is not None:
-            residual = {name: data[name] - mean for name, mean in means.items()}
-            log_density += log_ratio(error, thetas(x), residual, means)
+        log_density += log_ratio(error, thetas(x), residual, means)
         return jnp.where(valid & jnp.isfinite(log_density), log_density, -jnp.inf)
 
     information = information_at(model, model.observe, model.noise)
@@ -231,8 +226,7 @@ def _posterior_covariances(
     def covariance(data_set: tuple[Any, ...]) -> jax.Array:
         x, sizes, keys, means, error = data_set
         noise_key, *round_keys, error_key = keys
-        if error is not None:
-            means = error.draw(error_key, jnp.concatenate([thetas(x), sizes]), means)
+        means = error.draw(error_key, jnp.concatenate([thetas(x), sizes]), means)
         parts = model.distributions({}, means)
         each = jax.random.split(noise_key, len(parts))
         data = {n: d.sample(k) for (n, d), k in zip(parts.items(), each, strict=True)}
@@ -286,11 +280,11 @@ def _some(valid: Any) -> np.ndarray:
     return np.flatnonzero(valid)
 
 
-Errors = Callable[[Mapping[str, Any]], ModelError | None]
+Errors = Callable[[Mapping[str, Any]], ModelError]
 """The function of data without noise, by name, that returns the model's errors besides noise."""
 
 
-def of_each(errors: Errors, means: Mapping[str, jax.Array]) -> ModelError | None:
+def of_each(errors: Errors, means: Mapping[str, jax.Array]) -> ModelError:
     """Return the errors of all data sets, stacked along a leading axis; means (r, ...) by name."""
     arrays = {name: np.asarray(values) for name, values in means.items()}
     count = len(next(iter(arrays.values())))
@@ -309,12 +303,11 @@ def _stacked(arrays: Sequence[Any]) -> np.ndarray:
     return stack
 
 
-def sizes_of(error: ModelError | None, count: int = _SIZES) -> jax.Array:
+def sizes_of(error: ModelError, count: int = _SIZES) -> jax.Array:
     """Return equally probable sizes (count, 1) of the error; (count, 0) if its size is known."""
-    priors = [] if error is None else list(error.priors.values())
-    if not priors:
+    prior = next(iter(error.priors.values()), None)
+    if prior is None:
         return jnp.zeros((count, 0))
-    (prior,) = priors
     return prior.icdf((jnp.arange(count) + 0.5) / count)[:, None]
 
 
@@ -361,7 +354,7 @@ def next_measurement(
         information_of = jax.jit(information_at(model, Observations({name: part}), {name: noise}))
         gains, ratios = [], []
         for k in rows:
-            information = np.asarray(information_of(jnp.asarray(x[k]), None, jnp.zeros(0)))
+            information = np.asarray(information_of(jnp.asarray(x[k]), ModelError(), jnp.zeros(0)))
             precision = np.eye(len(root)) + root.T @ information @ root
             gains.append(0.5 * np.linalg.slogdet(precision)[1] / np.log(2.0))
             after = root @ np.linalg.solve(precision, root.T)

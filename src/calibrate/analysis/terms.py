@@ -19,6 +19,7 @@ from scipy.special import bdtr
 
 from calibrate.analysis.term_sets import PRESENT, posterior_of_sets, seen_columns
 from calibrate.measurements.specimens import SpecimenCurves
+from calibrate.model_error.algebra import check_algebra
 from calibrate.noise import information_about_means
 from calibrate.statistical_model.model import Model
 from emulator.core.display import TableRepr
@@ -175,17 +176,15 @@ def _of_tests(model: Model) -> dict[str, np.ndarray]:
 
 def _whitening(model: Model) -> np.ndarray:
     """Return the matrix (n, n) that makes the noise independent, of sd 1."""
-    scales = {}
-    for name, noise in model.noise.items():
-        if not noise.gaussian:
-            raise InputError(f"terms: the noise of {name} must be Gaussian")
-        # A half-normal prior's scale: its mean over that of a standard one.
-        scales[name] = {
-            key: prior.mean * np.sqrt(np.pi / 2.0) for key, prior in noise.priors.items()
-        }
+    check_algebra("terms", model.noise, known=False)
+    # A half-normal prior's scale: its mean over that of a standard one.
+    scales = {
+        name: {key: prior.mean * np.sqrt(np.pi / 2.0) for key, prior in noise.priors.items()}
+        for name, noise in model.noise.items()
+    }
     means = {name: jnp.zeros(shape) for name, shape in model.observe.shapes.items()}
     information = np.asarray(information_about_means(model.noise, means, scales))
-    return np.linalg.cholesky(information).T
+    return np.linalg.cholesky(np.diag(information) if information.ndim == 1 else information).T
 
 
 def _design(model: Model) -> np.ndarray:

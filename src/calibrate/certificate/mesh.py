@@ -118,8 +118,7 @@ def mesh_change(
         total=points[1] * states, desc="finer mesh", disable=not progress, unit="solve"
     ) as bar:
         differences = _differences_of_fem(predictive, finer, bar)
-        model_error = predictive.model.error
-        widened = model_error is not None and model_error.of_mesh
+        widened = predictive.model.error.of_mesh
         change = change_by(differences, pool, runs, points, rng, widened=widened)
     finer.forget()
     return replace(

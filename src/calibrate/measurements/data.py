@@ -78,9 +78,9 @@ def read_measurements(
     data: dict[str, np.ndarray] = {}
     known: dict[str, float] = {}
     paths: Mapping[str, str | Path] = files if isinstance(files, Mapping) else {"": files}
-    for given, path in paths.items():
-        if paths is files and (not given or set("@/+") & set(given)):
-            raise InputError(f"data: load state '{given}'; give it a name without @, / and +")
+    for prefix, path in paths.items():
+        if paths is files and (not prefix or set("@/+") & set(prefix)):
+            raise InputError(f"data: load state '{prefix}'; give it a name without @, / and +")
         file = Path(path)
         if not file.is_file():
             raise InputError(f"data file {path} does not exist")
@@ -92,8 +92,8 @@ def read_measurements(
             by_state = read_csv(table._replace(path=file))
         else:
             by_state = read_csv(file) if of_cells else read_netcdf(file)
-        for own, content in by_state.items():
-            state = ".".join(filter(None, (given, own)))
+        for inner, content in by_state.items():
+            state = ".".join(filter(None, (prefix, inner)))
             known |= {in_state(name, state): value for name, value in content.known.items()}
             for name, (part, values) in _observed(scene, content, state).items():
                 parts[name], data[name] = part, values
@@ -152,7 +152,7 @@ def _layouts(file: DataTable) -> dict[str, tuple[type[Observation], Layout]]:
     used: set[str] = set()
     for kind in OBSERVATIONS.values():
         for name, layout in kind.layouts(file.words).items():
-            words = [word for field in layout.fields for word in file.words_of(field)]
+            words = file.words_of(layout)
             if not set(words) <= set(file.words):
                 partial.append(words)
             elif name not in complete:
@@ -165,7 +165,7 @@ def _layouts(file: DataTable) -> dict[str, tuple[type[Observation], Layout]]:
     lacking = [[w for w in words if w not in file.words] for words in partial]
     fault = f"{file.what} '{min(lacking, key=len)[0]}' is missing" if partial else "no data"
     every = " or ".join(
-        ",".join(word for field in layout.fields for word in file.words_of(field))
+        ",".join(file.words_of(layout))
         for name, kind in OBSERVATIONS.items()
         for layout in kind.layouts((name,)).values()
     )

@@ -26,7 +26,8 @@ from calibrate.measurements.surface import SurfacePoints
 from calibrate.measurements.volume import CavityVolume
 from calibrate.state_names import in_state, split
 from emulator.core.errors import InputError
-from emulator.geometry.facets import MM3_PER_ML, enclosed_volume, encloses, openings, rim
+from emulator.core.units import IN_ML
+from emulator.geometry.facets import enclosed_volume, encloses, openings, rim
 from emulator.geometry.mesh import Mesh
 from emulator.hearts.surfaces import Surface
 from emulator.scenes.scene import Scene, cavity_sets
@@ -79,7 +80,7 @@ def frame_data(
         if facet_set in cavity_sets(scene) and len(surface.rims) == rims:
             volume = f"volume:{facet_set}{at}"
             observe[volume] = CavityVolume(scene, facet_set)
-            data[volume] = np.array(surface.volume / MM3_PER_ML)
+            data[volume] = np.array(surface.volume * IN_ML["mm3"])
     return observations(observe), data
 
 

@@ -109,7 +109,7 @@ def read_full_field(points: str | Path, displacements: str | Path | None = None)
 
 
 def _of_tables(points: Path, displacements: Path) -> FullField:
-    places, moved = (
+    places, table = (
         _cells(points, ("point", "x", "y")),
         _cells(displacements, ("frame", "point", "ux", "uy")),
     )
@@ -119,11 +119,11 @@ def _of_tables(points: Path, displacements: Path) -> FullField:
             raise InputError(f"data file {points}: row {row}, point '{cell['point']}' is twice")
         rows[cell["point"]], number = number, number + 1
     X = np.array([[places.number(row, word) for word in ("x", "y")] for row in places.rows])
-    frames = tuple(dict.fromkeys(cell["frame"] for cell in moved.rows.values()))
+    frames = tuple(dict.fromkeys(cell["frame"] for cell in table.rows.values()))
     index = {frame: k for k, frame in enumerate(frames)}
     u = np.full((len(frames), len(X), 2), np.nan)
     seen = np.zeros(u.shape[:2], bool)
-    for row, cell in moved.rows.items():
+    for row, cell in table.rows.items():
         if cell["point"] not in rows:
             raise InputError(
                 f"data file {displacements}: row {row}, point '{cell['point']}' is not in {points}"
@@ -134,7 +134,7 @@ def _of_tables(points: Path, displacements: Path) -> FullField:
                 f"data file {displacements}: row {row}, point '{cell['point']}' is twice in frame "
                 f"'{cell['frame']}'"
             )
-        u[at], seen[at] = [moved.number(row, word, gaps=True) for word in ("ux", "uy")], True
+        u[at], seen[at] = [table.number(row, word, gaps=True) for word in ("ux", "uy")], True
     return FullField(X, u, frames)
 
 
@@ -192,8 +192,8 @@ def sign_of(scene: Scene, parameter: str, amounts: Mapping[str, float]) -> float
     ranges = {p.name: p for p in scene.parameters}
     values = np.array(list(amounts.values()))
     negative = bool((values <= 0.0).all() and (values < 0.0).any())
-    own = ranges.get(parameter)
-    return -1.0 if negative and own is not None and own.low >= 0.0 else 1.0
+    limits = ranges.get(parameter)
+    return -1.0 if negative and limits is not None and limits.low >= 0.0 else 1.0
 
 
 def _side(amounts: Sequence[float] | np.ndarray) -> int:
@@ -280,8 +280,8 @@ def _check_order(field: FullField, amounts: np.ndarray) -> None:
     """Raise :class:`InputError` where the points do not move as what pulls them."""
     if len(amounts) < 4 or np.ptp(amounts) == 0.0:
         return
-    moved = np.nanmean(np.linalg.norm(field.displacement, axis=2), axis=1)
-    following = float(np.corrcoef(moved, np.abs(amounts))[0, 1])
+    motion = np.nanmean(np.linalg.norm(field.displacement, axis=2), axis=1)
+    following = float(np.corrcoef(motion, np.abs(amounts))[0, 1])
     if not following > _FOLLOWS:
         raise InputError(
             f"full field: the points' motion over {len(amounts)} frames correlates with the "

@@ -75,7 +75,7 @@ class Outputs:
                 seen = self._observe(u[None, self._rows], theta[None])
             else:
                 seen, _ = self._through(theta[None])
-            numbers += [jnp.ravel(each) for each in seen.values()]
+            numbers += [jnp.ravel(values) for values in seen.values()]
         if self._field:
             square = jnp.sum(u**2, axis=-1)
             # The derivative of a length is not defined where the displacement is 0.

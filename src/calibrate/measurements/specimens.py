@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibrate.measurements.collection import Observations
-from calibrate.measurements.observation import Block, DataField, derive
+from calibrate.measurements.observation import Block, DataField, Observation, derive
 from calibrate.measurements.points import PointObservation
 from emulator.core.errors import InputError
 from emulator.scenes.scene import all_nodes
@@ -98,15 +98,6 @@ class SpecimenCurves(PointObservation):
         rows = np.arange(int(np.prod(self.shape))) if entries is None else entries
         return np.divmod(rows, max(len(self.components), 1))
 
-    def gripped(self, shares: np.ndarray) -> Self:
-        """Return the observation with the stress that grips add.
-
-        shares : the added stress of each state as a fraction of its homogeneous stress, (d, 3, 3).
-
-        :class:`InputError` for an observation to which grips add nothing.
-        """
-        raise InputError(f"'{self.kind}' says nothing of a specimen's grips")
-
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the numbers (..., d, c), or (..., d) without components."""
         shape = "(d,c)" if self.components else "(d)"
@@ -115,19 +106,19 @@ class SpecimenCurves(PointObservation):
     def check_motion(self, columns: Mapping[str, np.ndarray]) -> Self:
         """Return the observation if a table's columns of motion are its own states."""
         scene, expected = self.scene, self.states
-        found = states_in(columns, tube=scene.tube, ordered=False)
-        each = 1 if scene.tube is None else scene.tube.size
-        if len(found.free) != each * len(expected.free):
+        in_table = states_in(columns, tube=scene.tube, ordered=False)
+        size = 1 if scene.tube is None else scene.tube.size
+        if len(in_table.free) != size * len(expected.free):
             raise InputError(
-                f"{len(found.free) // each} rows say how the specimen moves; scene '{scene.name}' "
-                f"has {len(expected.free)} states"
+                f"{len(in_table.free) // size} rows say how the specimen moves; scene "
+                f"'{scene.name}' has {len(expected.free)} states"
             )
-        apart = np.abs(found.gradients[::each] - expected.gradients).max(axis=(1, 2))
-        pulled = np.abs(found.pulls[::each] - expected.pulls).max(axis=1)
+        apart = np.abs(in_table.gradients[::size] - expected.gradients).max(axis=(1, 2))
+        pulled = np.abs(in_table.pulls[::size] - expected.pulls).max(axis=1)
         other = np.flatnonzero(
             (apart > _ROUND_OFF)
             | (pulled > _ROUND_OFF * np.abs(expected.pulls).max())
-            | (found.free[::each] != expected.free).any(axis=1)
+            | (in_table.free[::size] != expected.free).any(axis=1)
         )
         if len(other):
             raise InputError(
@@ -200,13 +191,16 @@ class Components(SpecimenCurves):
 def gripped_observations(observe: Observations, shares: np.ndarray) -> Observations:
     """Return the observations of a specimen with the stress that its grips add.
 
-    Arguments and errors are those of :meth:`SpecimenCurves.gripped`.
+    shares : the added stress of each state as a fraction of its homogeneous stress, (d, 3, 3).
+
+    :class:`InputError` for an observation without a method ``gripped``, to which they add nothing.
     """
-    parts = {}
+    parts: dict[str, Observation] = {}
     for name, part in observe.parts.items():
-        if not isinstance(part, SpecimenCurves):
+        gripped = getattr(part, "gripped", None)
+        if gripped is None:
             raise InputError(f"'{part.kind}' says nothing of a specimen's grips")
-        parts[name] = part.gripped(shares)
+        parts[name] = gripped(shares)
     return replace(observe, parts=parts)
 
 

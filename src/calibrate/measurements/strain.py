@@ -62,9 +62,11 @@ COMPONENTS = {
 """Directions, with the name in files of the strain along each."""
 
 
+@dataclass(frozen=True, eq=False)
 class Strains(PointObservation):
     """Strains (d, c) of ``components`` (c) at d places, made of those at s samples.
 
+    points : the places in the reference body, mm, (d, 3).
     nodes : the nodes of the samples' elements, each once, (k,).
     members : positions in ``nodes`` of each sample's element, (s, a).
     slopes : derivatives of its shape functions along each direction, 1/mm, (s, c, a).
@@ -72,6 +74,9 @@ class Strains(PointObservation):
     prefix : comes before the components' names in files.
     """
 
+    components: tuple[str, ...]
+    points: np.ndarray
+    nodes: np.ndarray
     members: np.ndarray
     slopes: np.ndarray
     directions: np.ndarray
@@ -114,19 +119,11 @@ class Strains(PointObservation):
         return None
 
 
-@dataclass(frozen=True, eq=False)
 class PointStrain(Strains):
     """Green-Lagrange strains (d, c) along ``components`` at ``points`` (d, 3) mm, without unit.
 
     In linear elements strains and directions are constant, and jump from one element to the next.
     """
-
-    components: tuple[str, ...]
-    points: np.ndarray
-    nodes: np.ndarray
-    members: np.ndarray
-    slopes: np.ndarray
-    directions: np.ndarray
 
     kind = "strain"
     usage = "strain:COMPONENT,...:N"
@@ -162,18 +159,13 @@ class PointStrain(Strains):
 class SegmentStrain(Strains):
     """Mean Green-Lagrange strains (d, c) of ``segments`` (d,) along ``components``, without unit.
 
-    points : the segments' centroids, mm, (d, 3).
+    ``points`` are the segments' centroids.
+
     weights : share of each sample, a quadrature point, in each segment's volume, (d, s).
     """
 
-    components: tuple[str, ...]
     segments: np.ndarray
-    points: np.ndarray
     weights: np.ndarray
-    nodes: np.ndarray
-    members: np.ndarray
-    slopes: np.ndarray
-    directions: np.ndarray
 
     kind = "segment_strain"
     usage = "segment_strain:COMPONENT,..."
@@ -222,7 +214,7 @@ class SegmentStrain(Strains):
         points = weights @ X.reshape(-1, 3)
         nodes, members = gather(mesh.elements[element])
         slopes = _slopes(gradients, directions)
-        return cls(names, segments, points, weights, nodes, members, slopes, directions)
+        return cls(names, points, nodes, members, slopes, directions, segments, weights)
 
 
 strains = PointStrain.of

@@ -77,7 +77,7 @@ class Stress(Components):
             self._check_grips(self.scene.grips.learned.shares[0])
 
     def gripped(self, shares: np.ndarray) -> Self:
-        """Return the stresses with those that grips add.
+        """Return the stresses with those that grips add, see :func:`gripped_observations`.
 
         :class:`InputError` where a component acts on no grip.
         """
@@ -112,11 +112,11 @@ class Stress(Components):
     @classmethod
     def layouts(cls, words: Collection[str]) -> dict[str, Layout]:
         """Return the layout of the columns of motions and stresses; of one each as an example."""
-        given = [word for word in words if is_stress(word)]
-        if not given and pull_columns(words):  # of measured stretches
+        stresses = [word for word in words if is_stress(word)]
+        if not stresses and pull_columns(words):  # of measured stretches
             return {}
-        areas = [w for w in words if given and _AREA.fullmatch(with_unit(w)[0])]
-        columns = [*(motion_columns(words) or ["stretch_x"]), *(given or ["stress_x"]), *areas]
+        areas = [w for w in words if stresses and _AREA.fullmatch(with_unit(w)[0])]
+        columns = [*(motion_columns(words) or ["stretch_x"]), *(stresses or ["stress_x"]), *areas]
         return {cls.name: Layout((), tuple(DataField(word, (word,)) for word in columns))}
 
     @classmethod
@@ -166,9 +166,9 @@ def is_stress(word: str) -> bool:
 
 def _parts(component: str) -> tuple[str, int, int]:
     """Return the measure of a component, its row and its column."""
-    found = _COMPONENT.fullmatch(component)
-    assert found is not None
-    measure, row, column = found.groups()
+    match = _COMPONENT.fullmatch(component)
+    assert match is not None
+    measure, row, column = match.groups()
     return measure, AXES.index(row), AXES.index(column or row)
 
 
@@ -177,18 +177,18 @@ def _in_kpa(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     areas, columns = dict[str, np.ndarray](), dict[str, tuple[str, np.ndarray]]()
     for word, values in arrays.items():
         name, unit = with_unit(word)
-        if (found := _AREA.fullmatch(name)) is not None:
-            areas[found[1]] = values * factor(word, unit, "mm2", IN_MM2)
+        if (match := _AREA.fullmatch(name)) is not None:
+            areas[match[1]] = values * factor(word, unit, "mm2", IN_MM2)
     for word, values in arrays.items():
         name, unit = with_unit(word)
         if _COMPONENT.fullmatch(name) is not None:
             component, stress = name, values * factor(word, unit, "kPa", IN_KPA)
-        elif (found := _PULL.fullmatch(name)) is not None:
-            if (area := areas.get(found[1])) is None:
+        elif (match := _PULL.fullmatch(name)) is not None:
+            if (area := areas.get(match[1])) is None:
                 raise InputError(
-                    f"column '{word}' is a force; give the area at rest as well, 'area{found[1]}'"
+                    f"column '{word}' is a force; give the area at rest as well, 'area{match[1]}'"
                 )
-            component = f"stress{found[1]}"
+            component = f"stress{match[1]}"
             stress = values * factor(word, unit, "mN", IN_MN) / area
         else:
             continue

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from calibrate.measurements.observation import Block, DataField
+from calibrate.measurements.observation import Block, DataField, Layout
 from calibrate.state_names import in_state, split, states_of
 from emulator.core import store
 from emulator.core.cells import TEXT, Cells, read_cells
@@ -71,9 +71,9 @@ class CSVTable:
                     )
         return values
 
-    def words_of(self, field: DataField) -> tuple[str, ...]:
-        """Return the words that hold ``field`` in a file of this format."""
-        return field.columns
+    def words_of(self, layout: Layout) -> list[str]:
+        """Return the words that hold an observation in a file of this format."""
+        return [word for field in layout.fields for word in field.columns]
 
     def arrays(self, fields: Sequence[DataField], others: Collection[str]) -> dict[str, np.ndarray]:
         """Return arrays of numbers by variable, NaN where a measured value is missing.
@@ -109,24 +109,24 @@ _UNITS = (
 
 def _without_units(cells: Cells) -> Cells:
     """Return a table with columns such as ``volume [L]`` in the project's units, without them."""
-    own: dict[str, tuple[str, float]] = {}
+    conversions: dict[str, tuple[str, float]] = {}
     for word in cells.words:
         name, unit = with_unit(word)
-        found = next((each for each in _UNITS if each[0].fullmatch(name)), None)
-        if unit and found is not None:
-            if name in (*cells.words, *(known for known, _ in own.values())):
+        usual = next((entry for entry in _UNITS if entry[0].fullmatch(name)), None)
+        if unit and usual is not None:
+            if name in (*cells.words, *(known for known, _ in conversions.values())):
                 raise InputError(f"data file {cells.path}: column '{name}' is there twice")
-            own[word] = name, factor(word, unit, *found[1:])
-    if not own:
+            conversions[word] = name, factor(word, unit, *usual[1:])
+    if not conversions:
         return cells
 
     def converted(row: int, word: str, cell: str) -> tuple[str, str]:
-        name, each = own.get(word, (word, 1.0))
-        number = cells.number(row, word, gaps=True) if each != 1.0 else 0.0
-        return name, cell if each == 1.0 or np.isnan(number) else repr(float(number * each))
+        name, ratio = conversions.get(word, (word, 1.0))
+        number = cells.number(row, word, gaps=True) if ratio != 1.0 else 0.0
+        return name, cell if ratio == 1.0 or np.isnan(number) else repr(float(number * ratio))
 
     rows = {k: dict(converted(k, w, c) for w, c in row.items()) for k, row in cells.rows.items()}
-    return cells._replace(words=[own.get(w, (w, 1.0))[0] for w in cells.words], rows=rows)
+    return cells._replace(words=[conversions.get(w, (w, 1.0))[0] for w in cells.words], rows=rows)
 
 
 def read_csv(table: Path | Cells) -> dict[str, CSVTable]:
@@ -152,11 +152,11 @@ def read_csv(table: Path | Cells) -> dict[str, CSVTable]:
     return {
         state: CSVTable(
             whole._replace(
-                words=[w for w in words if w != STATE and any(row[w] for row in own.values())],
-                rows=own,
+                words=[w for w in words if w != STATE and any(row[w] for row in part.values())],
+                rows=part,
             )
         )
-        for state, own in states.items()
+        for state, part in states.items()
     }
 
 
@@ -185,9 +185,9 @@ class NetCDFTable:
                 raise InputError(f"data file {self.path}: variable '{word}' is not a number")
         return {word.removeprefix(KNOWN): float(array) for word, array in arrays.items()}
 
-    def words_of(self, field: DataField) -> tuple[str, ...]:
-        """Return the field's variable."""
-        return (field.variable,)
+    def words_of(self, layout: Layout) -> list[str]:
+        """Return the fields' variables."""
+        return [field.variable for field in layout.fields]
 
     def arrays(
         self, fields: Sequence[DataField], others: Collection[str] = ()
@@ -214,10 +214,12 @@ def read_netcdf(path: Path) -> dict[str, NetCDFTable]:
             f"data file {path} is neither CSV ({', '.join(TEXT)}) nor readable netCDF"
         ) from error
     # Coordinates without values of their own belong to no state.
-    own = [str(word) for word in data.variables if word not in data.dims]
+    variables = [str(word) for word in data.variables if word not in data.dims]
     return {
-        state: NetCDFTable(path, [base for base, s in map(split, own) if s == state], data, state)
-        for state in states_of(own, f"data file {path}")
+        state: NetCDFTable(
+            path, [base for base, s in map(split, variables) if s == state], data, state
+        )
+        for state in states_of(variables, f"data file {path}")
     }
 
 

@@ -50,7 +50,7 @@ class OfTube(SpecimenCurves):
         F = H + jnp.eye(3)
         cauchy = jax.vmap(lambda P, F: P @ F.T / determinant(F))(P, F)
         assert self.scene.tube is not None
-        in_plane = (jnp.diagonal(each, axis1=1, axis2=2)[:, :2] for each in (F, cauchy))
+        in_plane = (jnp.diagonal(tensor, axis1=1, axis2=2)[:, :2] for tensor in (F, cauchy))
         return type(self).integral(self.scene.tube, *in_plane)
 
     @classmethod

@@ -24,6 +24,7 @@ from calibrate.model_error.systematic import (
     rigid_motion,
     spatial_modes,
 )
+from calibrate.noise.protocol import Scale, check_positive
 from calibrate.state_names import split
 from emulator.core import schema
 from emulator.core.errors import InputError, look_up
@@ -32,7 +33,7 @@ Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class Measurement:
     """The observations and data that systematic errors disturb.
 
     observe : the observations, without missing values.
@@ -102,11 +103,11 @@ class RigidMotion:
     about: Vector | None = None
     at: Literal["loaded", "rest"] = "loaded"
 
-    def systematic(self, name: str, measured: Measured) -> Systematic:
+    def systematic(self, name: str, measurement: Measurement) -> Systematic:
         """Return three shifts and three turns."""
         positions = {}
-        for each in measured.named(self.of):
-            points, displacement = measured.points(each)
+        for each in measurement.named(self.of):
+            points, displacement = measurement.points(each)
             positions[each] = points + displacement if self.at == "loaded" else points
         return rigid_motion(name, positions, self.shift, self.turn, self.about)
 
@@ -127,10 +128,10 @@ class Placement:
     def __post_init__(self) -> None:
         _check_not_negative(sd=self.sd)
 
-    def systematic(self, name: str, measured: Measured) -> Systematic:
+    def systematic(self, name: str, measurement: Measurement) -> Systematic:
         """Return one offset for each number."""
-        names = measured.named(self.of)
-        shapes = {measured.shape(each) for each in names}
+        names = measurement.named(self.of)
+        shapes = {measurement.shape(each) for each in names}
         if len(shapes) > 1:
             raise InputError(f"of: {', '.join(names)} have different numbers of points")
         sd = np.zeros(shapes.pop())
@@ -162,11 +163,11 @@ class Pins:
     def __post_init__(self) -> None:
         _check_not_negative(sd=self.sd)
 
-    def systematic(self, name: str, measured: Measured) -> Systematic:
+    def systematic(self, name: str, measurement: Measurement) -> Systematic:
         """Return one offset along each axis."""
         modes = {}
-        for each in measured.named(self.of):
-            points, displacement = measured.points(each)
+        for each in measurement.named(self.of):
+            points, displacement = measurement.points(each)
             if len(points) < 3 or np.linalg.matrix_rank(points - points.mean(axis=0)) < 2:
                 raise InputError(f"of: '{each}' has no three markers, not on one line")
             rows = self.sd * (rotation_of(points, displacement) - np.eye(3)).T
@@ -188,10 +189,10 @@ class Gain:
     def __post_init__(self) -> None:
         _check_not_negative(share=self.share)
 
-    def systematic(self, name: str, measured: Measured) -> Systematic:
+    def systematic(self, name: str, measurement: Measurement) -> Systematic:
         """Return one factor."""
-        names = measured.named(self.of)
-        shares = {each: np.full((1, *measured.shape(each)), self.share) for each in names}
+        names = measurement.named(self.of)
+        shares = {each: np.full((1, *measurement.shape(each)), self.share) for each in names}
         return Systematic((name,), {}, shares=shares)
 
 
@@ -220,24 +221,20 @@ class Curve:
     def __post_init__(self) -> None:
         _check_not_negative(share=self.share, sd=self.sd)
         if self.share_scale is not None:
-            if not self.share_scale > 0.0:
-                raise InputError(f"share_scale is {self.share_scale}; it must be above 0")
+            check_positive("share_scale", self.share_scale)
             if self.share or self.sd:
                 raise InputError("share_scale is beside share or sd; give one of them")
-        if not self.length > 0.0:
-            raise InputError(
-                f"length is {self.length}; it must be above 0, in the unit of the amount"
-            )
+        check_positive("length", self.length)
         if not 0.0 <= self.constant <= 1.0:
             raise InputError(f"constant is {self.constant}; it is a part, 0 to 1")
 
-    def systematic(self, name: str, measured: Measured) -> Systematic:
+    def systematic(self, name: str, measurement: Measurement) -> Systematic:
         """Return as many unknowns as the curve can tell apart."""
-        observations = measured.named(self.of)
+        observations = measurement.named(self.of)
         for each in observations:
-            if measured.shape(each) != ():
+            if measurement.shape(each) != ():
                 raise InputError(f"of: '{each}' is not a single number, as a force is")
-        amounts = np.array([measured.known(self.along, each) for each in observations])
+        amounts = np.array([measurement.known(self.along, each) for each in observations])
         size = None if self.share_scale is None else ("curve_share", self.share_scale)
         unit = curve_modes(amounts, self.length, constant=self.constant)
         share = self.share if size is None else 1.0
@@ -255,7 +252,7 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Field:
+class FieldError:
     r"""An error of displacements that is smooth in space and grows along the loading.
 
     It is what image correlation and the model miss of a full field. Of a component at the point X,
@@ -285,23 +282,22 @@ class Field:
     share: float = 0.01
 
     def __post_init__(self) -> None:
-        if (self.sd is None) == (self.sd_scale is None):
-            raise InputError("give either sd (known) or sd_scale (of its prior)")
-        given = {"length": self.length, "sd": self.sd, "sd_scale": self.sd_scale}
-        for name, value in {**given, "along_length": self.along_length}.items():
-            if value is not None and not value > 0.0:
-                raise InputError(f"{name} is {value}; it must be above 0")
+        Scale("field_sd", ("sd", "sd_scale"), self.sd, self.sd_scale)  # refuses what cannot be
+        check_positive("length", self.length)
+        if self.along_length is not None:
+            check_positive("along_length", self.along_length)
         if not 0.0 <= self.share < 1.0:
             raise InputError(f"share is {self.share}; it is a part of the variance, 0 to below 1")
 
-    def systematic(self, name: str, measured: Measured) -> Systematic:
+    def systematic(self, name: str, measurement: Measurement) -> Systematic:
         """Return as many unknowns as carry all but a share of the variance."""
-        observations = measured.named(self.of)
-        points, components = measured.points(observations[0])[0], measured.shape(observations[0])[1]
+        observations = measurement.named(self.of)
+        first = observations[0]
+        points, components = measurement.points(first)[0], measurement.shape(first)[1]
         for each in observations:
-            if not np.array_equal(measured.points(each)[0], points):
-                raise InputError(f"of: '{each}' and '{observations[0]}' are of other points")
-        amounts = np.array([measured.known(self.along, each) for each in observations])
+            if not np.array_equal(measurement.points(each)[0], points):
+                raise InputError(f"of: '{each}' and '{first}' are of other points")
+        amounts = np.array([measurement.known(self.along, each) for each in observations])
         if not np.abs(amounts).max() > 0.0:
             raise InputError(f"along: '{self.along}' is 0 in every state")
         along = np.ones((1, len(amounts)))
@@ -324,7 +320,7 @@ class Field:
         return Systematic(names, {n: rows[:, k] for k, n in enumerate(observations)}, size)
 
 
-Kind = RigidMotion | Placement | Pins | Gain | Curve | Field
+Kind = RigidMotion | Placement | Pins | Gain | Curve | FieldError
 
 SYSTEMATIC_ERRORS: dict[str, type[Kind]] = {
     "rigid_motion": RigidMotion,
@@ -332,7 +328,7 @@ SYSTEMATIC_ERRORS: dict[str, type[Kind]] = {
     "pins": Pins,
     "gain": Gain,
     "curve": Curve,
-    "field": Field,
+    "field": FieldError,
 }
 """Kinds of systematic error by their word in a file."""
 

@@ -1,17 +1,18 @@
-r"""Gaussian errors of a model's data besides its noise, integrated out in closed form.
+r"""Gaussian errors of a model's data besides its noise: a list of terms, integrated out exactly.
 
-.. math:: y = g(x) + V(x)^T z + \varepsilon, \qquad z \sim N(0, I_r), \qquad
+.. math:: y = g(x) + \sum_k V_k(x)^T z_k + \varepsilon, \qquad z_k \sim N(0, I), \qquad
           \varepsilon \sim N(0, W^{-1})
 
-with the unknowns x, the predicted data g of all observations (d numbers), the information W (d, d)
-of the noise, and modes V (r, d) in the unit of the data: what one standard deviation of each
-:math:`z_i` changes. Every error that correlates numbers is a set of modes,
+with the unknowns x, the predicted data g of all observations (d numbers), the information W of the
+noise (d, d), or its diagonal, and the modes of each term in the unit of the data: what one standard
+deviation of each :math:`z_{ki}` changes,
 
-.. math:: V_i(x) = \alpha_i(x)\, \left(A_i + B_i \circ g(x)\right),
+.. math:: V_k(x) = \alpha_k(x)\, \left(A_k + B_k \circ g(x)\right).
 
-with known A and B. Modes B are shares of the prediction, such as a load cell's gain. The size
-:math:`\alpha_i` is 1, or a function of the unknowns learned from FEM runs (:class:`Amplitude`), or
-a number that is inferred under a half-normal prior.
+A :class:`Term` declares A, B and the size :math:`\alpha`: 1, or a function of the unknowns learned
+from FEM runs (:class:`Amplitude`), or a number that is inferred under a half-normal prior
+(:class:`~calibrate.noise.protocol.Scale`). Modes B are shares of the prediction, such as a load
+cell's gain.
 
 Elimination without exchanges, :math:`I + V W V^T = L P L^T` with pivots P and a unit lower
 triangular L, gives all that is needed. With the reduced rows :math:`R = L^{-1} V W` the log
@@ -23,12 +24,9 @@ likelihood of the residual r = y - g changes by
 
 .. math:: W - R^T P^{-1} R
 
-is left. Where B = 0 and the size is common to all modes, the modes are chosen such that
-:math:`G = A W A^T` is diagonal, once: then L = I, :math:`P = I + \alpha^2 G`, and a likelihood of d
-numbers costs one product with the modes. These are the *fixed* modes, whose size is known or
-learned, and after them the *sized* ones, whose size is inferred, beside the information that the
-fixed modes leave. Where a mode is a share of the prediction, all that are not fixed *vary*, and are
-eliminated anew for each x.
+is left. Where B = 0, modes are chosen, once, for which :math:`G = A W A^T` is diagonal: then L = I,
+:math:`P = I + \alpha^2 G`, and a likelihood of d numbers costs one product with the modes. Others
+are eliminated anew for each x (:mod:`calibrate.model_error.algebra`).
 
 Shares are of the prediction g and not of the data y: the noise of the data would be scaled in the
 modes, too, so that smaller predictions would err less, and a scale of n numbers with share s would
@@ -38,7 +36,7 @@ be fitted too low by the factor :math:`1 + (n - 1) s^2` (Peelle's puzzle; D'Agos
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import jax
@@ -47,7 +45,7 @@ import numpy as np
 import numpyro.distributions as dist
 from jax.flatten_util import ravel_pytree
 
-from calibrate.noise.protocol import PLAUSIBLE
+from calibrate.noise.protocol import Scale
 from emulator.core.errors import InputError
 from emulator.core.gaussian_process import eliminated
 from emulator.surrogates.protocol import fingerprint_of
@@ -55,7 +53,12 @@ from emulator.surrogates.protocol import fingerprint_of
 Means = Mapping[str, jax.Array]
 """Data without noise by the observation's name."""
 
-_SIZED, _VARYING = "sized_", "varying_"  # prefixes of the arrays of these modes
+LEARNED = "the size of the forward map's error is learned"
+"""What is said of a size that is a function of the unknowns."""
+
+_SIZED, _VARYING = "sized_", "varying_"  # prefixes of the arrays of a second term
+_DIAGONAL = ("weights", "strength", "modes", "mixing")  # arrays of a term that is diagonal, and
+_DENSE = ("modes", "shares", "sized", "information")  # of one that is not
 # Recorded in saved errors, because in earlier versions shares were of the data.
 _SHARES = "of the prediction"
 
@@ -86,44 +89,76 @@ class Amplitude:
         log_weights = -0.5 * jnp.sum(((at - self.x) / self.width) ** 2, axis=-1)
         return jnp.exp(jax.nn.softmax(log_weights) @ self.log_sizes)
 
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
-class SizedModes:
-    """Modes with one size that is inferred, chosen such that G is diagonal.
-
-    weights, strength, modes : as of a :class:`ModelError`, W being what its fixed modes leave.
-    """
-
-    weights: np.ndarray
-    strength: np.ndarray
-    modes: np.ndarray
+    @property
+    def upper(self) -> float:
+        """The greatest size of the runs."""
+        return float(np.exp(np.max(self.log_sizes)))
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
-class VaryingModes:
-    """Modes that depend on the prediction, and beside them those whose size is inferred.
+class Term:
+    """Errors of all data with one size.
 
-    modes, shares : A and B, (r, d).
-    sized : 1 for each mode whose size is inferred, 0 where it is 1, (r,).
-    information : W beside these modes, (d, d), or its diagonal (d,) where it has no other entries.
+    modes, shares : A and B, (r, d); no B where nothing is a share of the prediction.
+    size : the size of the modes; ``None`` for 1.
+    sized : 0 for each mode whose size is 1 whatever ``size`` is, 1 for the others, (r,); ``None``
+        for 1.
+    weights, strength : A W, (r, d), with W the information that terms before leave, and the
+        diagonal of G, (r,), where the modes are chosen such that G is diagonal.
+    mixing : orthogonal matrix (r, s) that makes such modes of the s declared ones, less the rows of
+        modes that no datum could tell from nothing; ``None`` where the declared ones are forgotten.
+    information : W, (d, d), or its diagonal (d,), where they are not.
+    names : names of the unknowns z of the declared modes of a systematic error.
+    of_mesh : whether modes of a learned size were learned on a finer mesh.
     """
 
     modes: np.ndarray
-    shares: np.ndarray
-    sized: np.ndarray
-    information: np.ndarray
+    shares: np.ndarray | None = None
+    size: Amplitude | Scale | None = None
+    sized: np.ndarray | None = None
+    weights: Any = None
+    strength: Any = None
+    mixing: Any = None
+    information: np.ndarray | None = None
+    names: tuple[str, ...] = jax.tree.static(default=())
+    of_mesh: bool = jax.tree.static(default=False)
 
-    def at(self, size: jax.Array | float, means: jax.Array) -> jax.Array:
-        """Return V (r, d) where the inferred size is ``size`` and the prediction ``means`` (d,)."""
-        alpha = jnp.where(self.sized > 0.0, size, 1.0)
-        return alpha[:, None] * (self.modes + self.shares * means)
+    @property
+    def is_learned(self) -> bool:
+        """Whether the errors are the forward map's, learned from FEM runs."""
+        return isinstance(self.size, Amplitude)
 
-    def weighted(self, V: jax.Array) -> jax.Array:
-        """Return V W (r, d)."""
-        diagonal = self.information.ndim == V.ndim - 1
-        return V * self.information if diagonal else V @ self.information
+    @property
+    def unknown_size(self) -> str:
+        """What is said of the size if it is not known; empty for 1."""
+        if isinstance(self.size, Scale):
+            return f"the size '{self.size.name}' is inferred (scale {self.size.prior_scale:g})"
+        return LEARNED if self.is_learned else ""
+
+    def alpha(self, unknowns: jax.Array) -> Any:
+        """Return the size, (), at ``unknowns``, of which an inferred one is the last."""
+        if isinstance(self.size, Scale):
+            return unknowns[-1]
+        return 1.0 if self.size is None else self.size(unknowns)
+
+    def at(self, alpha: Any, means: jax.Array) -> jax.Array:
+        """Return V (r, d) where the size is ``alpha`` and the prediction ``means`` (d,)."""
+        if self.sized is not None:
+            alpha = jnp.where(self.sized > 0.0, alpha, 1.0)[:, None]
+        modes = jnp.asarray(self.modes)
+        return alpha * (modes if self.shares is None else modes + self.shares * means)
+
+    def eliminated(
+        self, unknowns: jax.Array, means: jax.Array, columns: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Return the pivots P (r,), and R ``columns`` (r, m) of columns (d, m)."""
+        alpha = self.alpha(unknowns)
+        if self.strength is not None:
+            return 1.0 + alpha**2 * self.strength, alpha * (self.weights @ columns)
+        V = self.at(alpha, means)
+        VW = times(V, self.information)
+        return eliminated(VW @ V.T + jnp.eye(len(V)), VW @ columns)
 
 
 @jax.tree_util.register_dataclass
@@ -131,84 +166,103 @@ class VaryingModes:
 class ModelError:
     """All errors of a model's data besides its noise.
 
-    weights : A W of the fixed modes, (r, d).
-    strength : the diagonal of G, (r,).
-    modes : A, the fixed modes at size 1, (r, d).
-    amplitude : the size of the fixed modes; ``None`` for 1.
-    sized : the modes whose size is inferred, and
-    varying : the modes that vary; ``None`` where there are none. There are never both.
-    names : names of the s unknowns z of systematic errors with known modes.
-    mixing : orthogonal matrix (r, s) that makes the fixed modes of those of the named unknowns,
-        less the rows of modes that no datum could tell from nothing.
-    of_mesh : whether the errors were learned on a finer mesh, so that they are the mesh's as well.
-    size_name, size_scale : name of the inferred size in the posterior, and the scale of its
-        half-normal prior; empty and 0 where none is inferred.
+    terms : the terms in the order in which they are eliminated.
     """
 
-    weights: np.ndarray
-    strength: np.ndarray
-    modes: np.ndarray
-    amplitude: Amplitude | None = None
-    sized: SizedModes | None = None
-    varying: VaryingModes | None = None
-    mixing: np.ndarray | None = None
-    names: tuple[str, ...] = jax.tree.static(default=())
-    of_mesh: bool = jax.tree.static(default=False)
-    size_name: str = jax.tree.static(default="")
-    size_scale: float = jax.tree.static(default=0.0)
+    terms: tuple[Term, ...] = ()
 
     @property
-    def of_fem(self) -> bool:
-        """Whether data differ from FEM on the map's mesh by these errors, too."""
-        return self.amplitude is None or self.of_mesh
+    def declarations(self) -> tuple[Term, ...]:
+        """All terms, with the declared modes where these are known, to be integrated out anew."""
+        return tuple(
+            term if term.mixing is None else replace(term, modes=term.mixing.T @ term.modes)
+            for term in self.terms
+        )
+
+    @property
+    def systematic(self) -> ModelError:
+        """The errors that are not learned from FEM runs."""
+        terms = [term for term in self.terms if not term.is_learned]
+        for term in self.terms:
+            if term.is_learned and term.sized is not None:
+                rows = {n: getattr(term, n)[term.sized == 0.0] for n in _DENSE[:3]}
+                terms.append(replace(term, **rows, size=None))
+        return ModelError(tuple(terms))
+
+    @property
+    def of_fem(self) -> ModelError:
+        """The errors by which data differ from FEM on the map's mesh, too."""
+        return self if self.of_mesh else self.systematic
+
+    @property
+    def is_learned(self) -> bool:
+        """Whether errors of the forward map, learned from FEM runs, are among them."""
+        return isinstance(self.size, Amplitude)
+
+    @property
+    def of_mesh(self) -> bool:
+        """Whether errors were learned on a finer mesh, so that they are the mesh's as well."""
+        return any(term.is_learned and term.of_mesh for term in self.terms)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the unknowns z of systematic errors of known size, without shares."""
+        return self.terms[0].names if self.terms else ()
+
+    @property
+    def size(self) -> Amplitude | Scale | None:
+        """The size that is not known, of which there is one at most."""
+        return next((term.size for term in self.terms if term.size is not None), None)
 
     @property
     def priors(self) -> dict[str, dist.Distribution]:
         """Prior of the size that is inferred, by its name in the posterior; empty if none is."""
-        return {self.size_name: dist.HalfNormal(self.size_scale)} if self.size_name else {}
-
-    def size(self, unknowns: jax.Array) -> jax.Array:
-        """Return the size of the fixed modes, (), at ``unknowns``."""
-        return jnp.ones(()) if self.amplitude is None else self.amplitude(unknowns)
+        return self.size.priors if isinstance(self.size, Scale) else {}
 
     def log_ratio(self, unknowns: jax.Array, residual: Means, means: Means) -> jax.Array:
         """Return what the errors add to the log likelihood of ``residual``, data less ``means``.
 
         unknowns : theta's unknowns (q,), then the size of :attr:`priors` if one is inferred.
         """
-        flat, _ = ravel_pytree(dict(residual))
-        pivots, rows = self._eliminated(unknowns, means, flat[:, None])
-        return 0.5 * jnp.sum(rows[:, 0] ** 2 / pivots - jnp.log(pivots))
+        total, means_flat = jnp.zeros(()), ravel_pytree(dict(means))[0]
+        column = ravel_pytree(dict(residual))[0][:, None]
+        for term in self.terms:
+            pivots, rows = term.eliminated(unknowns, means_flat, column)
+            total += 0.5 * jnp.sum(rows[:, 0] ** 2 / pivots - jnp.log(pivots))
+        return total
 
     def information_left(
         self, information: jax.Array, unknowns: jax.Array, means: Means
     ) -> jax.Array:
-        """Return what is left of the noise's ``information`` (d, d) about ``means``.
+        """Return what is left of the noise's ``information`` about ``means``, (d, d).
 
         It is the inverse covariance of the data given the unknowns. How the covariance itself
-        depends on the unknowns is not counted.
+        depends on the unknowns is not counted. A diagonal (d,) stays one where there are no errors.
         """
-        pivots, rows = self._eliminated(unknowns, means, jnp.eye(len(information)))
-        return information - (rows.T / pivots) @ rows
+        if not self.terms:
+            return information
+        flat = ravel_pytree(dict(means))[0]
+        left = jnp.diag(information) if information.ndim == 1 else information
+        for term in self.terms:
+            pivots, rows = term.eliminated(unknowns, flat, jnp.eye(len(information)))
+            left = left - (rows.T / pivots) @ rows
+        return left
 
     def draw(self, rng_key: jax.Array, unknowns: jax.Array, means: Means) -> dict[str, jax.Array]:
         """Return data without noise that might have come: ``means`` plus a draw of the errors."""
         flat, unravel = ravel_pytree(dict(means))
-        key, second = rng_key, rng_key
-        V = self._not_fixed(self._inferred_size(unknowns), flat)
-        if V is not None:
-            key, second = jax.random.split(rng_key)
-        z = jax.random.normal(key, self.strength.shape)
-        perturbed = flat + self.size(unknowns) * (z @ self.modes)
-        if V is not None:
-            perturbed += jax.random.normal(second, (len(V),)) @ V
+        keys = jax.random.split(rng_key, len(self.terms)) if self.terms[1:] else [rng_key]
+        perturbed = flat
+        for key, term in zip(keys, self.terms, strict=False):
+            V = term.at(term.alpha(unknowns), flat)
+            perturbed += jax.random.normal(key, (len(V),)) @ V
         return unravel(perturbed)
 
     def largest(self, means: Means) -> np.ndarray:
-        """Return V (r, d) beside data like ``means``, an inferred size at its 99.7 % quantile."""
-        flat, _ = ravel_pytree(dict(means))
-        V = self._not_fixed(PLAUSIBLE * self.size_scale, flat)
-        return self.modes if V is None else np.vstack([self.modes, np.asarray(V)])
+        """Return V (r, d) beside data like ``means``, each size as large as is plausible."""
+        flat = ravel_pytree(dict(means))[0]
+        rows = [term.at(term.size.upper if term.size else 1.0, flat) for term in self.terms]
+        return np.concatenate([np.zeros((0, len(flat))), *rows])
 
     def unknowns(self, residual: Means) -> tuple[np.ndarray, np.ndarray]:
         """Return mean (s,) and covariance (s, s) of the named z given ``residual``, at one draw.
@@ -218,43 +272,15 @@ class ModelError:
         InputError
             Some of the errors vary with the prediction or in size.
         """
-        if self.sized is not None or self.varying is not None:
-            of_size = f"the size '{self.size_name}' is inferred"
-            reason = of_size if self.size_name else "some are shares of what is predicted"
+        first, *others = self.terms
+        if others or first.size is not None:
+            reason = self.terms[-1].unknown_size or "some are shares of what is predicted"
             raise InputError(f"what is known of errors: {reason}")
-        assert self.mixing is not None
         flat = np.asarray(ravel_pytree(dict(residual))[0])
-        pivots = 1.0 + self.strength
-        mean = self.mixing.T @ ((self.weights @ flat) / pivots)
-        learned = (self.mixing.T * (1.0 - 1.0 / pivots)) @ self.mixing
+        pivots = 1.0 + first.strength
+        mean = first.mixing.T @ ((first.weights @ flat) / pivots)
+        learned = (first.mixing.T * (1.0 - 1.0 / pivots)) @ first.mixing
         return mean, np.eye(len(self.names)) - learned
-
-    def _eliminated(
-        self, unknowns: jax.Array, means: Means, columns: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Return the pivots P (r,), and R ``columns`` (r, m) of columns (d, m)."""
-        alpha = self.size(unknowns)
-        pivots, rows = 1.0 + alpha**2 * self.strength, alpha * (self.weights @ columns)
-        if self.sized is not None:
-            size = self._inferred_size(unknowns)
-            pivots = jnp.concatenate([pivots, 1.0 + size**2 * self.sized.strength])
-            rows = jnp.concatenate([rows, size * (self.sized.weights @ columns)])
-        if self.varying is None:
-            return pivots, rows
-        flat, _ = ravel_pytree(dict(means))
-        V = self.varying.at(self._inferred_size(unknowns), flat)
-        VW = self.varying.weighted(V)
-        more = eliminated(VW @ V.T + jnp.eye(len(V)), VW @ columns)
-        return jnp.concatenate([pivots, more[0]]), jnp.concatenate([rows, more[1]])
-
-    def _inferred_size(self, unknowns: jax.Array) -> jax.Array | float:
-        return unknowns[-1] if self.size_name else 1.0
-
-    def _not_fixed(self, size: jax.Array | float, means: jax.Array) -> jax.Array | None:
-        """Return V (r, d) of all modes that are not fixed; None where there are none."""
-        if self.sized is not None:
-            return size * jnp.asarray(self.sized.modes)
-        return None if self.varying is None else self.varying.at(size, means)
 
     @property
     def fingerprint(self) -> str:
@@ -263,24 +289,22 @@ class ModelError:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all that changes a likelihood, by its name in a file."""
-        arrays = {n: getattr(self, n) for n in ("weights", "strength", "modes", "mixing")}
-        if self.amplitude is not None:
-            arrays |= vars(self.amplitude)
-        for prefix, group in ((_SIZED, self.sized), (_VARYING, self.varying)):
-            if group is not None:
-                arrays |= {f"{prefix}{n}": v for n, v in vars(group).items()}
-        if self.size_name:
-            arrays["size_scale"] = np.array(self.size_scale)
-        if self.of_mesh:
-            arrays["of_mesh"] = True
+        arrays: dict[str, Any] = {}
+        for term in self.terms:
+            kind, prefix = (_DENSE, _VARYING) if term.strength is None else (_DIAGONAL, _SIZED)
+            prefix = prefix if arrays else ""
+            arrays |= {f"{prefix}{name}": getattr(term, name) for name in kind}
+        arrays |= vars(self.size) if isinstance(self.size, Amplitude) else {}
+        arrays["size_scale"] = getattr(self.size, "prior_scale", None)
+        arrays["of_mesh"] = self.of_mesh or None
         return {name: np.asarray(value) for name, value in arrays.items() if value is not None}
 
     @property
     def words(self) -> dict[str, Any]:
         """The plain JSON that :meth:`restore` needs besides arrays; empty for learned errors."""
-        if self.mixing is None:
+        if self.terms[0].mixing is None:
             return {}
-        return {"names": self.names, "size": self.size_name, "shares": _SHARES}
+        return {"names": self.names, "size": next(iter(self.priors), ""), "shares": _SHARES}
 
     @classmethod
     def restore(cls, arrays: Mapping[str, np.ndarray], words: Mapping[str, Any]) -> ModelError:
@@ -298,40 +322,29 @@ class ModelError:
                 "the posterior is older than systematic errors that are shares of predictions; "
                 "infer again"
             )
-        own: dict[str, Any] = {
-            n: v for n, v in arrays.items() if not n.startswith((_SIZED, _VARYING))
-        }
-        of_mesh = own.pop("of_mesh", None) is not None
-        size = {each.name: own.pop(each.name) for each in fields(Amplitude) if each.name in own}
-        if size:
-            own["amplitude"] = Amplitude(**{**size, "width": float(size["width"])})
-        if sized := {n.removeprefix(_SIZED): v for n, v in arrays.items() if n.startswith(_SIZED)}:
-            own["sized"] = SizedModes(**sized)
-        if varying := {n.removeprefix(_VARYING): v for n, v in arrays.items() if _VARYING in n}:
-            own["varying"] = VaryingModes(**varying)
-        own |= {"size_scale": float(own.get("size_scale", 0.0)), "of_mesh": of_mesh}
-        names = tuple(words.get("names", ()))
-        return cls(**own, names=names, size_name=words.get("size") or "")
+        groups: dict[str, dict[str, Any]] = {"": {}, _SIZED: {}, _VARYING: {}}
+        for name, array in arrays.items():
+            prefix = next((p for p in (_SIZED, _VARYING) if name.startswith(p)), "")
+            groups[prefix][name.removeprefix(prefix)] = array
+        first, *others = groups.values()
+        of_mesh, scale = first.pop("of_mesh", None) is not None, first.pop("size_scale", None)
+        learned = {f.name: first.pop(f.name) for f in fields(Amplitude) if f.name in first}
+        if missing := set(_DIAGONAL[:3]) - set(first):
+            raise TypeError(f"{', '.join(missing)} is missing")
+        size: Any = None if scale is None else inferred_size(words.get("size", ""), float(scale))
+        if learned:
+            size = Amplitude(**{**learned, "width": float(learned["width"])})
+        terms = [Term(**group) for group in (first, *others) if group]
+        terms[-1] = replace(terms[-1], size=size, of_mesh=of_mesh)
+        terms[0] = replace(terms[0], names=tuple(words.get("names", ())))
+        return cls(tuple(terms))
 
 
-def diagonal(
-    modes: np.ndarray, information: np.ndarray, fixed: ModelError | None = None
-) -> tuple[np.ndarray, ...]:
-    """Return fixed modes of the same covariance with a diagonal G.
+def inferred_size(name: str, scale: float) -> Scale:
+    """Return a size of this name in the posterior, under a half-normal prior of this scale."""
+    return Scale(name, (f"the size '{name}'", "its scale"), None, scale)
 
-    modes : the modes as they are declared, (s, d).
-    information : W, (d, d), or its diagonal (d,).
-    fixed : modes that come before these; W is what they leave.
 
-    Returns
-    -------
-    weights, strength, modes, mixing : the fields of :class:`ModelError`.
-    """
-    weighted = modes * information if information.ndim == 1 else modes @ information
-    if fixed is not None:
-        between = (weighted @ fixed.modes.T) / (1.0 + fixed.strength)
-        weighted = weighted - between @ fixed.weights
-    strength, mixing = np.linalg.eigh(weighted @ modes.T)
-    visible = strength > 1e-12 * max(float(strength.max(initial=0.0)), 1e-300)
-    rows = mixing[:, visible].T
-    return rows @ weighted, strength[visible], rows @ modes, rows
+def times(rows: Any, information: Any) -> Any:
+    """Return V W (r, d) of rows V (r, d) and an information (d, d), or its diagonal (d,)."""
+    return rows * information if information.ndim == 1 else rows @ information

@@ -3,8 +3,8 @@ r"""Systematic errors: what is unknown of a measurement itself, or of a law alon
 Such an error is the same in many numbers: a camera that was moved between two loads shifts and
 turns all markers of one state together. Left out, it passes for material. Each error is a
 :class:`Systematic`: its unknowns, in units of their standard deviations, and the change of the data
-for each. :func:`marginalised` integrates all of them out, so that sampling has no more unknowns
-than before.
+for each. They are integrated out (:mod:`calibrate.model_error.marginal`), so that sampling has no
+more unknowns than before.
 
 Small rotations are linear: an angle :math:`\omega` moves a point at x by
 :math:`\omega \times (x - c)`, to second order in the angle.
@@ -24,7 +24,7 @@ the variance that is the same along the whole curve, and Matérn's kernel k of s
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import jax
@@ -32,7 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from calibrate.model_error.marginal import ModelError, SizedModes, VaryingModes, diagonal
+from calibrate.model_error.marginal import Term, inferred_size
 from emulator.core.errors import InputError
 from emulator.core.gaussian_process import matern32
 
@@ -59,13 +59,11 @@ class Systematic:
     size: tuple[str, float] | None = None
     shares: Mapping[str, np.ndarray] = field(default_factory=dict)
 
-    @property
-    def varies(self) -> bool:
-        """Whether the change of the data depends on unknowns of the model."""
-        return self.size is not None or any(np.any(each) for each in self.shares.values())
+    def term(self, shapes: Shapes) -> Term:
+        """Return the error in all data, raveled, of observations of these shapes, by name.
 
-    def check(self, shapes: Shapes) -> None:
-        """Raise :class:`InputError` unless the error fits observations of these shapes, by name."""
+        :class:`InputError` where it does not fit them.
+        """
         for name, modes in (*self.modes.items(), *self.shares.items()):
             if name not in shapes:
                 raise InputError(
@@ -78,70 +76,19 @@ class Systematic:
                     f"{expected}"
                 )
 
+        def rows(modes: Mapping[str, np.ndarray]) -> np.ndarray:
+            every = {name: np.zeros((len(self.names), *shapes[name])) for name in shapes} | dict(
+                modes
+            )
+            return np.hstack([np.reshape(V, (len(V), -1)) for V in jax.tree.leaves(every)])
 
-def marginalised(
-    errors: Sequence[Systematic], shapes: Shapes, information: np.ndarray, unknowns: Sequence[str]
-) -> ModelError:
-    """Return ``errors`` together, integrated out.
-
-    shapes : shape of each observation's data, by name.
-    information : information of the noise about the data's means, (d, d), or its diagonal (d,)
-        where it has no other entries.
-    unknowns : names of the model's unknowns, which a size that is inferred may not have.
-
-    :class:`InputError` where an error does not fit the observations, or two sizes are to be
-    inferred.
-    """
-    for error in errors:
-        error.check(shapes)
-    known = [error for error in errors if not error.varies]
-    weights, strength, modes, mixing = diagonal(_rows(known, shapes, "modes"), information)
-    names = tuple(name for error in known for name in error.names)
-    fixed = ModelError(weights, strength, modes, mixing=mixing, names=names)
-    varying = [error for error in errors if error.varies]
-    if not varying:
-        return fixed
-    sizes = list(dict.fromkeys(error.size for error in varying if error.size is not None))
-    if len(sizes) > 1:
-        raise InputError(
-            f"systematic errors: sizes {sizes[0]} and {sizes[1]} are to be inferred; only one can "
-            "be, by one name and scale"
+        shares = rows(self.shares)
+        return Term(
+            rows(self.modes),
+            shares if np.any(shares) else None,
+            None if self.size is None else inferred_size(*self.size),
+            names=self.names,
         )
-    name, scale = sizes[0] if sizes else ("", 0.0)
-    if name in unknowns:
-        raise InputError(
-            f"systematic errors: a size is called '{name}', as an unknown of the model"
-        )
-    fixed = replace(fixed, size_name=name, size_scale=scale)
-    if not any(np.any(each) for error in varying for each in error.shares.values()):
-        found = diagonal(_rows(varying, shapes, "modes"), information, fixed)
-        return replace(fixed, sized=SizedModes(*found[:3]))
-    whole = np.diag(information) if information.ndim == 1 else information
-    left = np.asarray(
-        replace(fixed, size_name="").information_left(jnp.asarray(whole), jnp.zeros(0), {})
-    )
-    on_diagonal = np.diagonal(left)
-    sized = [np.full(len(error.names), float(error.size is not None)) for error in varying]
-    return replace(
-        fixed,
-        varying=VaryingModes(
-            modes=_rows(varying, shapes, "modes"),
-            shares=_rows(varying, shapes, "shares"),
-            sized=np.concatenate(sized),
-            information=on_diagonal if np.array_equal(left, np.diag(on_diagonal)) else left,
-        ),
-    )
-
-
-def _rows(errors: Sequence[Systematic], shapes: Shapes, kind: str) -> np.ndarray:
-    """Return the ``modes`` or ``shares`` of all errors as rows (s, d) of all data."""
-    rows = [np.zeros((0, sum(int(np.prod(shape)) for shape in shapes.values())))]
-    for error in errors:
-        s = len(error.names)
-        each = {name: np.zeros((s, *shape)) for name, shape in shapes.items()}
-        each |= dict(getattr(error, kind))
-        rows.append(np.hstack([np.reshape(e, (s, -1)) for e in jax.tree.leaves(each)]))
-    return np.vstack(rows)
 
 
 def rigid_motion(

@@ -36,7 +36,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
@@ -167,7 +167,6 @@ class CorrelatedNoise(Noise):
 
     kind: ClassVar[str] = "correlated"
     usage: ClassVar[str] = "correlated:length=MM,sd=SD,spatial_sd=SD"
-    independent: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         check_positive("correlation length (mm)", self.length)
@@ -204,12 +203,19 @@ class CorrelatedNoise(Noise):
 
     def distribution(self, mean: jax.Array, values: Mapping[str, jax.Array]) -> dist.Distribution:
         """Return the Gaussian around ``mean``, the part that correlates integrated out."""
-        independent, spatial = (scale.value(values) for scale in self.scales)
-        variances = independent**2 + spatial**2 * self.modes.eigenvalues
-        return SpatialNormal(self.modes, mean, jnp.sqrt(variances))
+        return SpatialNormal(self.modes, mean, jnp.sqrt(self._variances(values)))
+
+    def information(self, mean: jax.Array, values: Mapping[str, jax.Array]) -> jax.Array:
+        """Return the inverse of the covariance, (d, d)."""
+        rotation = self.modes.from_data(jnp.eye(mean.size))
+        return self.modes.to_data(rotation / self._variances(values))
 
     def simulate(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
         """Return noise of data of this shape; :class:`InputError` where an sd is not known."""
-        independent, spatial = (scale.needed() for scale in self.scales)
-        sds = np.sqrt(independent**2 + spatial**2 * self.modes.eigenvalues)
+        sds = np.sqrt(self._variances({s.name: s.needed() for s in self.scales}))
         return np.asarray(self.modes.to_data(jnp.asarray(rng.normal(0.0, sds)))).reshape(shape)
+
+    def _variances(self, values: Mapping[str, Any]) -> Any:
+        """Return the variances along the modes, (e,)."""
+        independent, spatial = (scale.value(values) for scale in self.scales)
+        return independent**2 + spatial**2 * self.modes.eigenvalues

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from numbers import Real
 from types import MappingProxyType
@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
-from jax.flatten_util import ravel_pytree
+from jax.scipy.linalg import block_diag
 
 from emulator.core import schema
 from emulator.core.errors import InputError
@@ -39,6 +39,7 @@ class Sites(NamedTuple):
         return cls(np.repeat(positions, components, axis=0), np.tile(np.arange(components), count))
 
 
+@jax.tree_util.register_static
 @dataclass(frozen=True)
 class Scale:
     """A standard deviation or another scale: known, or inferred under a half-normal prior.
@@ -60,8 +61,8 @@ class Scale:
         if (self.known is None) == (self.prior_scale is None):
             first, second = self.options
             raise InputError(f"give either {first} (known) or {second} (of its prior)")
-        given = self.prior_scale if self.known is None else self.known
-        check_positive("standard deviation", given)
+        value = self.prior_scale if self.known is None else self.known
+        check_positive("standard deviation", value)
 
     @property
     def priors(self) -> dict[str, dist.Distribution]:
@@ -91,13 +92,11 @@ class Noise(ABC):
 
     kind : its name in the registry and in JSON.
     gaussian : whether it is Gaussian where all its numbers are known.
-    independent : whether the numbers of the data err each by itself.
     usage : its options on the command line, for help and errors.
     """
 
     kind: ClassVar[str]
     gaussian: ClassVar[bool] = True
-    independent: ClassVar[bool] = True
     usage: ClassVar[str]
 
     def __post_init__(self) -> None:
@@ -143,6 +142,15 @@ class Noise(ABC):
         ``values`` are the inferred scales by name.
         """
 
+    def information(self, mean: jax.Array, values: Mapping[str, jax.Array]) -> jax.Array:
+        """Return the information of data of d numbers about their ``mean``.
+
+        It is the curvature of the log density at the mean: its diagonal (d,) where the numbers are
+        independent, (d, d) otherwise. ``values`` are the inferred scales by name.
+        """
+        of_one = jax.hessian(lambda m: self.distribution(m, values).log_prob(jnp.zeros(())))
+        return jnp.full(mean.size, -of_one(jnp.zeros(())))
+
     @abstractmethod
     def simulate(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
         """Return noise of data of this shape; :class:`InputError` where a scale is unknown."""
@@ -157,38 +165,16 @@ def information_about_means(
     means: Mapping[str, jax.Array],
     scales: Mapping[str, Mapping[str, jax.Array]] = MappingProxyType({}),
 ) -> jax.Array:
-    """Return the information (d, d) of data about their means.
+    """Return the information of all data about their means, in the order of ``ravel_pytree``.
 
-    It is the curvature of the log density at the mean, in the order of ``ravel_pytree``.
+    It is a matrix (d, d), or its diagonal (d,) where all numbers err independently.
 
     scales : the values of each noise's scales that are not known.
     """
-    flat, log_density = _about_means(noise, means, scales)
-    return -jax.hessian(log_density)(flat)
-
-
-def independent_information(
-    noise: Mapping[str, Noise], means: Mapping[str, jax.Array]
-) -> jax.Array:
-    """Return the diagonal (d,) of :func:`information_about_means`, of independent errors."""
-    flat, log_density = _about_means(noise, means, {})
-    return -jax.jvp(jax.grad(log_density), (flat,), (jnp.ones_like(flat),))[1]
-
-
-def _about_means(
-    noise: Mapping[str, Noise],
-    means: Mapping[str, jax.Array],
-    scales: Mapping[str, Mapping[str, jax.Array]],
-) -> tuple[jax.Array, Callable[[jax.Array], jax.Array]]:
-    """Return the means (d,) and the log density of data there as a function of means (d,)."""
-    flat, unravel = ravel_pytree(means)
-
-    def log_density(shifted: jax.Array) -> jax.Array:
-        at = unravel(shifted)
-        terms = [noise[n].distribution(at[n], scales.get(n, {})).log_prob(means[n]) for n in means]
-        return sum(terms, jnp.zeros(()))
-
-    return flat, log_density
+    parts = [noise[n].information(means[n], scales.get(n, {})) for n in sorted(means)]
+    if all(part.ndim == 1 for part in parts):
+        return jnp.concatenate(parts)
+    return block_diag(*(jnp.diag(part) if part.ndim == 1 else part for part in parts))
 
 
 def check_positive(what: str, value: object) -> None:

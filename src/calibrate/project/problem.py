@@ -248,5 +248,5 @@ def build_model(problem: Problem, *, progress: bool = False) -> tuple[Model, Map
 def by_fem(model: Model, load_steps: int = 1) -> Model:
     """Return ``model`` with FEM as its forward map, to make data for checks of the model."""
     whole = by_solver(simulator_of(model.forward.scene, load_steps), model.full)
-    error = model.error if model.error is not None and model.error.of_fem else None
-    return replace(model, full=whole, forward=whole.at(model.observe.nodes), error=error)
+    forward = whole.at(model.observe.nodes)
+    return replace(model, full=whole, forward=forward, error=model.error.of_fem)

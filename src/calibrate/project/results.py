@@ -75,7 +75,7 @@ def save_results(folder: Path, problem: Problem, posterior: Posterior) -> None:
         write_data(new / DATA, problem.observe, problem.data)
         write_json(new / RUN, run)
         registry.keep_forward(posterior.model.full, new / FORWARD)
-        if (error := posterior.model.error) is not None:
+        if (error := posterior.model.error).terms:
             metadata = {_DESCRIPTION: json.dumps(error.words)} if error.words else {}
             save_arrays(new / ERROR, error.arrays(), metadata)
         posterior.tree.attrs["run"] = json.dumps(run)
@@ -148,7 +148,7 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
     has_error = run.error_runs or run.mesh_error_runs or run.systematic
     run_model = replace(
         model_of(run, forward, observe),
-        error=_read_error(folder / ERROR, path, tree) if has_error else None,
+        error=_read_error(folder / ERROR, path, tree) if has_error else ModelError(),
         check_scale=False,  # the data was checked when it was sampled, or the check was overruled
     )
     observed = tree["observed_data"]

@@ -123,10 +123,6 @@ class Run:
             )
         for name, description in self.systematic.items():
             read_systematic(name, description)
-        if self.systematic and (self.error_runs or self.mesh_error_runs):
-            raise InputError(
-                "systematic and error_runs are both given; a likelihood allows for one of them"
-            )
 
     @property
     def is_synthetic(self) -> bool:

@@ -33,10 +33,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from calibrate.model_error.kinds import Measured, read_systematic
-from calibrate.model_error.marginal import Amplitude, ModelError
-from calibrate.model_error.systematic import Systematic, marginalised
-from calibrate.noise.protocol import independent_information, information_about_means
+from calibrate.model_error.algebra import check_algebra, marginalised
+from calibrate.model_error.kinds import Measurement, read_systematic
+from calibrate.model_error.marginal import LEARNED, Amplitude, ModelError, Term, times
+from calibrate.model_error.systematic import Systematic
+from calibrate.noise import information_about_means
 from calibrate.statistical_model.fem_likelihood import FEMLikelihood
 from calibrate.statistical_model.finer_fem import finer_fem
 from calibrate.statistical_model.model import Model
@@ -64,12 +65,13 @@ def with_systematic(model: Model, *errors: Systematic) -> Model:
     Raises
     ------
     InputError
-        No errors are given, one does not fit the model's observations, noise is not Gaussian or of
-        unknown sd, or the model has another error.
+        No errors are given, one does not fit the model's observations, or the errors or the noise
+        lack what is needed to integrate them out.
     """
     if not errors:
         raise InputError("systematic errors: give one or more")
-    return replace(model, error=_marginaliser(model)(errors))
+    terms = [error.term(model.observe.shapes) for error in errors]
+    return replace(model, error=_joined(model, "systematic errors", terms))
 
 
 def with_described_errors(
@@ -98,48 +100,43 @@ def errors_of_data(
     :class:`InputError` where an error does not fit, by its name; and as :func:`with_systematic`.
     """
     kinds = {name: read_systematic(name, each) for name, each in descriptions.items()}
-    marginalise = _marginaliser(model)
+    check_algebra("systematic errors", model.noise)
     parameters = model.forward.scene.parameter_names
     states = zip(model.states.states, model.states.entries, strict=True)
     theta = {state: dict(zip(parameters, row, strict=True)) for state, row in states}
 
     def error_of(data: Mapping[str, Any]) -> ModelError:
         arrays = {name: np.asarray(values) for name, values in data.items()}
-        measured = Measured(model.observe, arrays, theta)
-        errors = []
+        measurement = Measurement(model.observe, arrays, theta)
+        terms = []
         for name, kind in kinds.items():
             try:
-                errors.append(measured.present(kind.systematic(name, measured)))
+                error = measurement.present(kind.systematic(name, measurement))
+                terms.append(error.term(model.observe.shapes))
             except InputError as wrong:
                 raise InputError(f"systematic '{name}': {wrong}") from wrong
-        return marginalise(errors)
+        return _joined(model, "systematic errors", terms)
 
     return error_of
 
 
-def _noise_information(model: Model, errors: str) -> np.ndarray:
-    """Return the information (d, d) of the noise about the data's means, or its diagonal (d,).
+def _joined(model: Model, what: str, terms: Sequence[Term]) -> ModelError:
+    """Return the errors of ``model``'s data and these terms together, integrated out.
 
-    Marginalisation beside the noise needs one that is the same for all data and unknowns, so
-    :class:`InputError` is raised where the noise is not Gaussian or of unknown sd.
+    :class:`InputError`, which begins with ``what``, where they lack a property that this needs.
     """
-    for name, noise in model.noise.items():
-        if noise.priors or not noise.gaussian:
-            raise InputError(f"{errors}: the noise of {name} must be Gaussian and of known sd")
+    every = (*model.error.declarations, *terms)
+    check_algebra(what, model.noise, {term.unknown_size for term in every} - {""})
+    error = marginalised(every, _information(model))
+    if taken := error.priors.keys() & replace(model, error=ModelError()).names:
+        raise InputError(f"{what}: a size is called '{taken.pop()}', as an unknown of the model")
+    return error
+
+
+def _information(model: Model) -> np.ndarray:
+    """Return the information (d, d) of the noise about the data's means, or its diagonal (d,)."""
     means = {name: jnp.zeros(shape) for name, shape in model.observe.shapes.items()}
-    independent = all(noise.independent for noise in model.noise.values())
-    information = independent_information if independent else information_about_means
-    return np.asarray(jax.jit(lambda m: information(model.noise, m))(means))
-
-
-def _marginaliser(model: Model) -> Callable[[Sequence[Systematic]], ModelError]:
-    """Return the function that integrates systematic errors of ``model``'s data out."""
-    if model.error is not None:
-        raise InputError("systematic errors: the model's likelihood has an error already")
-    information = _noise_information(model, "systematic errors")
-    return partial(
-        marginalised, shapes=model.observe.shapes, information=information, unknowns=model.names
-    )
+    return np.asarray(information_about_means(model.noise, means))
 
 
 def with_error(
@@ -172,7 +169,9 @@ def with_error(
         raise InputError(f"error of the forward map: {runs} FEM runs; give {FEWEST} or more")
     if simulator.scene.fingerprint != model.forward.scene.fingerprint:
         raise InputError("error of the forward map: the simulator is for another scene")
-    information = _noise_information(model, "error of the forward map")
+    systematic = model.error.systematic.declarations
+    sizes = {LEARNED, *(term.unknown_size for term in systematic)} - {""}
+    check_algebra("error of the forward map", model.noise, sizes)
     predict = jax.jit(model.predict)
     fem = FEMLikelihood(model, simulator)
     finer = finer_fem(model, simulator) if of_mesh else None
@@ -206,8 +205,9 @@ def with_error(
             f"error of the forward map: FEM and the map answered at {len(errors)} of {runs} draws "
             f"of the prior; {FEWEST} are needed"
         )
-    fitted = fit(np.array(unknowns), np.array(errors), information, of_mesh=of_mesh)
-    return replace(model, error=fitted)
+    information = _information(model)
+    term = fit(np.array(unknowns), np.array(errors), information, of_mesh=of_mesh)
+    return replace(model, error=marginalised([*systematic, term], information))
 
 
 class MapErrors(NamedTuple):
@@ -244,7 +244,7 @@ def map_errors(
     data : the data by the observation's name.
     """
     # Equations of a body that is loaded at rest are of two displacements: at rest, and from there.
-    if simulator.scene.loaded_by or _allows_for_map(model):
+    if simulator.scene.loaded_by or model.error.is_learned:
         return NOT_ASKED
     distance = compiled(partial(newton_distance, simulator.system))
     observe, predict, means = model.observe, jax.jit(model.full), jax.jit(model.means)
@@ -298,11 +298,6 @@ def map_errors(
     return MapErrors(sizes, largest_move(predictive, some, known, ask_further, count, rng))
 
 
-def _allows_for_map(model: Model) -> bool:
-    """Return whether the likelihood of ``model`` allows for the map's error already."""
-    return model.error is not None and model.error.amplitude is not None
-
-
 def in_noise_sd(
     model: Model, errors: np.ndarray, draws: Mapping[str, np.ndarray]
 ) -> dict[str, float]:
@@ -313,7 +308,7 @@ def in_noise_sd(
     errors : the map's data less FEM's at draws, flat (s, m).
     draws : draws (s,) by the unknown's name, of which an inferred noise sd is taken.
     """
-    if not len(errors) or _allows_for_map(model):
+    if not len(errors) or model.error.is_learned:
         return {}
     unravel = ravel_pytree({name: jnp.zeros(n) for name, n in model.observe.shapes.items()})[1]
     sizes, sds = {}, noise_sds(model, draws)
@@ -325,7 +320,7 @@ def in_noise_sd(
 
 def fit(
     unknowns: np.ndarray, errors: np.ndarray, information: np.ndarray, *, of_mesh: bool = False
-) -> ModelError:
+) -> Term:
     """Return the error that FEM runs show.
 
     unknowns : the unknowns at which FEM was run, (n, q).
@@ -333,28 +328,18 @@ def fit(
     information : the information W of the noise about its mean, (d, d), or its diagonal (d,).
     of_mesh : whether FEM was run on a finer mesh.
     """
-    if information.ndim == 1:
-        information = np.diag(information)
-    root = np.linalg.cholesky(information)  # W = root root^T
     centre, scale = unknowns.mean(axis=0), np.maximum(unknowns.std(axis=0), 1e-12)
-    x, whitened = (unknowns - centre) / scale, errors @ root
-    norms = np.linalg.norm(whitened, axis=1)
+    x = (unknowns - centre) / scale
+    norms = np.sqrt(np.sum(times(errors, information) * errors, axis=1))
     log_sizes = np.log(np.maximum(norms, 1e-12 * max(float(norms.max()), 1e-300)))
     width = min(
         _WIDTHS, key=lambda w: float(np.mean((_left_out(x, log_sizes, w) - log_sizes) ** 2))
     )
-    shapes = whitened / np.exp(_left_out(x, log_sizes, width))[:, None]
-    _, singular, right = np.linalg.svd(shapes / np.sqrt(len(shapes)), full_matrices=False)
-    used = np.arange(len(singular)) < _MODES
-    used &= singular > 1e-6 * max(float(singular[0]), 1e-300)
-    rows = singular[used, None] * right[used]  # A root, orthogonal
-    return ModelError(
-        weights=rows @ root.T,
-        strength=singular[used] ** 2,
-        modes=np.linalg.solve(root.T, rows.T).T,
-        amplitude=Amplitude(x, log_sizes, float(width), centre, scale),
-        of_mesh=of_mesh,
-    )
+    sizes = np.exp(_left_out(x, log_sizes, width))[:, None]
+    size = Amplitude(x, log_sizes, float(width), centre, scale)
+    (term,) = marginalised([Term(errors / sizes / np.sqrt(len(x)), size=size)], information).terms
+    largest = np.argsort(-term.strength)[:_MODES]
+    return Term(term.modes[largest], size=size, of_mesh=of_mesh)
 
 
 def _left_out(x: np.ndarray, values: np.ndarray, width: float) -> np.ndarray:

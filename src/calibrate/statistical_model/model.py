@@ -77,7 +77,7 @@ class Model:
     noise_names: Mapping[str, str]
     states: LoadStates
     prior: Prior
-    error: ModelError | None = None
+    error: ModelError = field(default_factory=ModelError)
     prior_cut: Mapping[str, float] = field(default_factory=dict)
     check_scale: bool = True
     dependence: Dependence | None = None
@@ -108,7 +108,7 @@ class Model:
             for name, sites in self.noise_sites.items()
             for scale, site in sites.items()
         }
-        return noises if self.error is None else {**noises, **self.error.priors}
+        return noises | self.error.priors
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -196,11 +196,11 @@ class Model:
         # Where the forward map has no answer, the density is zero, not NaN.
         numpyro.factor("valid", jnp.where(valid, 0.0, -jnp.inf))
         observed = None if data is None else self.observe.name(data, "data")
-        if self.error is not None:
+        if self.error.terms:
             if observed is None:
                 means = self.error.draw(numpyro.prng_key(), self._stacked(draw), means)
             else:
-                numpyro.factor("error", self._error_ratio(draw, means, observed))
+                numpyro.factor("error", self._ratio(self.error, draw, means, observed))
         for name, distribution in self.distributions(draw, means).items():
             obs = None if observed is None else observed[name]
             numpyro.sample(f"observed_{name}", distribution, obs=obs)
@@ -256,16 +256,12 @@ class Model:
 
         Where the likelihood allows for errors of the mesh or of the measurement, FEM has them, too.
         """
-        log_density = self.log_density(draw, means, data)
-        if self.error is not None and self.error.of_fem:
-            log_density += self._error_ratio(draw, means, data)
-        return log_density
+        ratio = self._ratio(self.error.of_fem, draw, means, data)
+        return self.log_density(draw, means, data) + ratio
 
     def fem_means(self, rng_key: jax.Array, draw: Mapping[str, Any], means: Data) -> Data:
         """Return FEM's ``means`` at ``draw``, plus a draw of the errors that FEM has, too."""
-        if self.error is None or not self.error.of_fem:
-            return means
-        return self.error.draw(rng_key, self._stacked(draw), means)
+        return self.error.of_fem.draw(rng_key, self._stacked(draw), means)
 
     def map_log_likelihood(self, draw: Mapping[str, Any], data: Data) -> jax.Array:
         """Return the log density of ``data``, (), with the forward map and its errors.
@@ -279,15 +275,15 @@ class Model:
         """Return NumPyro's sites of the program at ``draw`` (a number by name) and ``data``."""
         return handlers.trace(handlers.substitute(self, data=dict(draw))).get_trace(data)
 
-    def _error_ratio(self, draw: Mapping[str, Any], means: Data, data: Data) -> jax.Array:
-        assert self.error is not None
+    def _ratio(
+        self, error: ModelError, draw: Mapping[str, Any], means: Data, data: Data
+    ) -> jax.Array:
         residual = {name: data[name] - mean for name, mean in means.items()}
-        return self.error.log_ratio(self._stacked(draw), residual, means)
+        return error.log_ratio(self._stacked(draw), residual, means)
 
     def _stacked(self, draw: Mapping[str, Any]) -> jax.Array:
         """Return theta's unknowns, then the size of errors that is inferred, as one array."""
-        sizes = () if self.error is None else self.error.priors
-        names = (*self.states.unknowns, *sizes)
+        names = (*self.states.unknowns, *self.error.priors)
         return jnp.stack([jnp.asarray(draw[name], float) for name in names])
 
     # Its data.
@@ -303,7 +299,7 @@ class Model:
         observe, present = leave_out_missing(self.observe, self._fitting(data))
         if observe is self.observe:
             return self, self.check_data(present)
-        if self.error is not None:
+        if self.error.terms:
             raise InputError(
                 "the model's error is for data without missing values; give it to the model that "
                 "Model.given makes"
@@ -329,12 +325,11 @@ class Model:
     def _largest_sds(self, data: Mapping[str, np.ndarray]) -> dict[str, float]:
         """Return the largest plausible sd of each observation by noise and errors, in its unit."""
         sds = {name: noise.upper_sd for name, noise in self.noise.items()}
-        if self.error is not None and self.error.of_fem:
-            like = {name: jnp.asarray(values) for name, values in data.items()}
-            each = jax.vmap(ravel_pytree(like)[1])(jnp.asarray(self.error.largest(like)))
-            for name, modes in each.items():
-                largest = np.linalg.norm(np.reshape(modes, (len(modes), -1)), 2)
-                sds[name] = float(np.hypot(sds[name], largest))
+        like = {name: jnp.asarray(values) for name, values in data.items()}
+        rows = jnp.asarray(self.error.of_fem.largest(like))
+        for name, modes in jax.vmap(ravel_pytree(like)[1])(rows).items() if len(rows) else ():
+            largest = np.linalg.norm(np.reshape(modes, (len(modes), -1)), 2)
+            sds[name] = float(np.hypot(sds[name], largest))
         return sds
 
     def _fitting(self, data: np.ndarray | Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -24,7 +24,7 @@ from calibrate.importance.proposals import (
     resampled,
 )
 from calibrate.importance.weights import normalised
-from calibrate.statistical_model.predictive import Correction, Evaluated, Predictive
+from calibrate.statistical_model.predictive import Correction, Densities, Predictive
 
 _ENOUGH = 800.0  # effective points at which the pool is good
 _FOLLOWING = 2048  # points of the proposal that follows the draws
@@ -45,7 +45,7 @@ class Pool(WeightedPoints):
 
     predictive: Predictive
     correction: Correction
-    at: Evaluated
+    at: Densities
     follower: int = 0
 
     @classmethod
@@ -162,7 +162,7 @@ class Pool(WeightedPoints):
             pool = pool.stepped(poorest, rng)
         return pool
 
-    def densities(self, z: np.ndarray) -> Evaluated:
+    def densities(self, z: np.ndarray) -> Densities:
         """Return log densities at points z (s, p), under this pool's correction."""
         return self.predictive.evaluate(z, self.correction)
 

@@ -194,7 +194,7 @@ def _fitted(
     return fitted, where_likely
 
 
-class Evaluated(NamedTuple):
+class Densities(NamedTuple):
     """Log densities at points (s, p), each (s,), ``-inf`` where the density is zero.
 
     prior : the prior density of z, its Jacobian included.
@@ -250,17 +250,17 @@ class Predictive:
         return prior_draws(self._density, rng_key, count)
 
     def by_map(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return ``prior``, ``cheap`` and ``means`` of :class:`Evaluated` at points (s, p)."""
+        """Return ``prior``, ``cheap`` and ``means`` of :class:`Densities` at points (s, p)."""
         return in_blocks(self._map_block, z)
 
-    def evaluate(self, z: np.ndarray, correction: Correction) -> Evaluated:
+    def evaluate(self, z: np.ndarray, correction: Correction) -> Densities:
         """Return log densities at points (s, p)."""
         prior, cheap, means = self.by_map(z)
         unknown = np.full(len(z), -np.inf)
-        at = Evaluated(prior, cheap, unknown, unknown, means)
+        at = Densities(prior, cheap, unknown, unknown, means)
         return self.evaluate_again(z, at, correction)
 
-    def evaluate_again(self, z: np.ndarray, at: Evaluated, correction: Correction) -> Evaluated:
+    def evaluate_again(self, z: np.ndarray, at: Densities, correction: Correction) -> Densities:
         """Return ``at``, of ``z`` (s, p), under another correction; the map is not asked again."""
         program = partial(self._correction_block, correction)
         corrected, variance = in_blocks(program, z, at.means)

@@ -181,5 +181,5 @@ def test_errors_that_do_not_fit_are_refused():
         expected_precision(displacements(BOTH), systematic={"e": {**GAIN, "of": "volume"}})
     observe = cal.nodal_displacements(SCENE, NODES)
     heavy = cal.model(FORWARD, observe, cal.StudentTNoise(dof=4.0, scale=0.1), BOTH)
-    with pytest.raises(InputError, match="must be Gaussian and of known sd"):
+    with pytest.raises(InputError, match="must be Gaussian; it is student_t"):
         expected_precision(heavy, systematic={"e": GAIN})

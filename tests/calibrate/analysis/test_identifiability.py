@@ -164,7 +164,7 @@ def test_a_uniform_scale_above_0_enters_relative_to_its_mean(beam, forward):
 def test_an_unknown_noise_is_refused(beam, forward):
     observe = cal.nodal_displacements(beam, NODES)
     model = cal.model(forward, observe, cal.GaussianNoise(sd_scale=0.1))
-    with pytest.raises(InputError, match="give every noise a known sd"):
+    with pytest.raises(InputError, match="displacement must be of known sd; noise_sd is"):
         expected_precision(model)
 
 

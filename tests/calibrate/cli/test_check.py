@@ -36,7 +36,10 @@ def test_what_data_would_determine(capsys):
         ),
         (["check", "prior", "nowhere"], "scene 'nowhere'"),
         (["check", "sbc", *BEAM, "--true-noise", "volume=1"], "'volume' is not observed"),
-        (["identify", "before", *BEAM, "--noise-scale", "1"], "give every noise a known sd"),
+        (
+            ["identify", "before", *BEAM, "--noise-scale", "1"],
+            "must be of known sd; noise_sd is inferred",
+        ),
         (["identify", "after", "nowhere"], "nowhere"),
     ],
 )

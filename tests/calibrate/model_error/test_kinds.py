@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal
 
 import calibrate as cal
 from calibrate.model_error import ModelError, Systematic
-from calibrate.model_error.kinds import Measured, read_systematic, rotation_of
+from calibrate.model_error.kinds import Measurement, read_systematic, rotation_of
 from calibrate.model_error.systematic import curve_correlation
 from calibrate.statistical_model.errors import with_described_errors
 from emulator.core.errors import InputError
@@ -40,7 +40,7 @@ def data(model):
 
 def of(model, data, **description):
     """The one error that a description makes."""
-    return read_systematic("e", description).systematic("e", Measured(model.observe, data, {}))
+    return read_systematic("e", description).systematic("e", Measurement(model.observe, data, {}))
 
 
 def test_a_rigid_motion_turns_points_where_they_were_seen_or_at_rest(model, data):
@@ -253,7 +253,7 @@ def test_one_share_is_inferred_and_not_beside_a_known_one():
     with pytest.raises(InputError, match=r"share_scale is -0.3; it must be above 0"):
         with_described_errors(model, data, {"e": {**curve, "share_scale": -0.3}})
     two = {"a": {**curve, "share_scale": 0.3}, "b": {**curve, "share_scale": 0.2}}
-    with pytest.raises(InputError, match="only one can be, by one name and scale"):
+    with pytest.raises(InputError, match="only one size can be unknown, by one name and sc"):
         with_described_errors(model, data, two)
 
 
@@ -392,7 +392,7 @@ def test_a_share_of_the_variance_may_be_left_out(frames):
     sizes = {}
     for share in (0.0, 0.4):
         given, _ = with_described_errors(model, data, {"dic": {**field, "share": share}})
-        modes = given.error.modes
+        modes = given.error.terms[0].modes
         sizes[share] = len(modes), float(np.sum(modes**2))
     assert sizes[0.4][0] < sizes[0.0][0]
     assert 0.6 <= sizes[0.4][1] / sizes[0.0][1] < 1.0

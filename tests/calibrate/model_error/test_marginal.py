@@ -1,4 +1,4 @@
-"""Errors integrated out, fixed modes and modes that vary together, against dense covariances."""
+"""Terms integrated out, made diagonal once or eliminated anew, against dense covariances."""
 
 from dataclasses import replace
 
@@ -8,131 +8,223 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from calibrate.model_error.marginal import Amplitude, ModelError, SizedModes, VaryingModes, diagonal
+import calibrate as cal
+from calibrate.model_error.algebra import check_algebra, marginalised
+from calibrate.model_error.marginal import LEARNED, Amplitude, ModelError, Term, inferred_size
 from emulator.core.errors import InputError
 
 MEANS = {"a": jnp.array([1.0, -2.0]), "b": jnp.array([[3.0, 0.5], [1.5, -1.0]])}
 RESIDUAL = {"a": jnp.array([0.3, 0.1]), "b": jnp.array([[-0.2, 0.4], [0.0, 0.7]])}
-FLAT = np.concatenate([np.ravel(MEANS["a"]), np.ravel(MEANS["b"])])
+FLAT, R = (np.concatenate([np.ravel(d["a"]), np.ravel(d["b"])]) for d in (MEANS, RESIDUAL))
+RNG = np.random.default_rng(1)
+X = np.array([7.0, 0.4])  # theta's unknown, and the size where one is inferred
+KNOWN = Term(RNG.normal(size=(3, 6)), names=("k0", "k1", "k2"))
+GAIN = Term(RNG.normal(size=(1, 6)), 0.3 * RNG.normal(size=(1, 6)), names=("gain",))
+SIZED = Term(RNG.normal(size=(4, 6)), size=inferred_size("size", 0.5), names=tuple("abcd"))
+CURVE = replace(SIZED, shares=0.3 * RNG.normal(size=(4, 6)))
+SIZE = Amplitude(RNG.normal(size=(9, 1)), RNG.normal(size=9), 0.3, np.array([7.1]), np.array([0.5]))
+OF_MAP = Term(RNG.normal(size=(2, 6)), size=SIZE)
+OF_MESH = replace(OF_MAP, of_mesh=True)
+SIZES = (0.4, 0.4, 1.0, 0.4)  # of CURVE in rows of which the third has a known size
+LISTS = {
+    "known": [KNOWN],
+    "shares": [GAIN],
+    "sized": [SIZED],
+    "known and sized": [KNOWN, SIZED],
+    "known and shares": [KNOWN, GAIN, replace(KNOWN, modes=2.0 * KNOWN.modes)],
+    "sized shares": [CURVE],
+    "all of a measurement": [GAIN, SIZED, KNOWN, CURVE],
+    "map": [OF_MAP],
+    "mesh": [OF_MESH],
+    "known and map": [KNOWN, OF_MAP],
+    "shares and map": [KNOWN, GAIN, OF_MAP],
+    "shares and mesh": [OF_MESH, GAIN],
+}
 
 
-@pytest.fixture(scope="module")
-def information():
+@pytest.fixture(scope="module", params=["correlated noise", "independent noise"])
+def information(request):
     half = np.random.default_rng(0).normal(size=(6, 6))
-    return half @ half.T + np.eye(6)
+    W = half @ half.T + np.eye(6)
+    return W if request.param == "correlated noise" else np.diagonal(W)
 
 
-def error_of(information, fixed):
-    """Four modes that vary, two of them of an inferred size, after ``fixed`` (s, 6)."""
-    rng = np.random.default_rng(1)
-    weights, strength, modes, mixing = diagonal(fixed, information)
-    names = tuple(map(str, range(len(fixed))))
-    first = ModelError(weights, strength, modes, mixing=mixing, names=names)
-    varying = VaryingModes(
-        modes=rng.normal(size=(4, 6)),
-        shares=0.3 * rng.normal(size=(4, 6)),
-        sized=np.array([0.0, 1.0, 1.0, 0.0]),
-        information=np.asarray(first.information_left(jnp.asarray(information), jnp.zeros(0), {})),
-    )
-    return replace(first, varying=varying, size_name="size", size_scale=0.5)
+def whole(information):
+    return np.diag(information) if information.ndim == 1 else information
 
 
-@pytest.fixture(scope="module", params=[0, 3], ids=["varying", "fixed and varying"])
-def error(request, information):
-    return error_of(information, np.random.default_rng(2).normal(size=(request.param, 6)))
+def dense(terms, x):
+    """The covariance that the terms add, by hand."""
+    S = np.zeros((6, 6))
+    for term in terms:
+        V = term.modes if term.shares is None else term.modes + term.shares * FLAT
+        if isinstance(term.size, Amplitude):
+            V = V * float(SIZE(jnp.asarray(x[:1])))
+        elif term.size is not None:
+            V = V * x[1]
+        S += V.T @ V
+    return S
 
 
-def dense(error, size):
-    """All modes V (r, 6) where the inferred size is ``size``."""
-    varying = error.varying
-    alpha = np.where(varying.sized > 0.0, size, 1.0)[:, None]
-    return np.vstack([error.modes, alpha * (varying.modes + varying.shares * FLAT)])
+def unknowns(terms, size=X[1]):
+    inferred = any(term.size is not None and not term.is_learned for term in terms)
+    return jnp.array([X[0], size] if inferred else X[:1])
 
 
-def ratio(error, size):
-    return error.log_ratio(jnp.array([7.0, size]), RESIDUAL, MEANS)
-
-
+@pytest.mark.parametrize("terms", LISTS.values(), ids=LISTS)
 @pytest.mark.parametrize("size", [0.0, 0.4, 2.0])
-def test_the_ratio_and_the_information_are_those_of_dense_covariances(error, information, size):
-    C, V = np.linalg.inv(information), dense(error, size)
-    residual = np.concatenate([np.ravel(RESIDUAL["a"]), np.ravel(RESIDUAL["b"])])
-    expected = [multivariate_normal(np.zeros(6), S).logpdf(residual) for S in (C + V.T @ V, C)]
-    assert float(ratio(error, size)) == pytest.approx(expected[0] - expected[1], rel=1e-10)
-    left = error.information_left(jnp.asarray(information), jnp.array([size]), MEANS)
-    np.testing.assert_allclose(left, np.linalg.inv(C + V.T @ V), atol=1e-10)
+def test_the_ratio_and_the_information_are_those_of_dense_covariances(terms, information, size):
+    error, C = marginalised(terms, information), np.linalg.inv(whole(information))
+    systematic = [term for term in terms if not term.is_learned]
+    of_fem = terms if OF_MESH in terms else systematic
+    for those, part in ((terms, error), (of_fem, error.of_fem), (systematic, error.systematic)):
+        S, at = C + dense(those, (X[0], size)), unknowns(terms, size)
+        wanted = [multivariate_normal(np.zeros(6), each).logpdf(R) for each in (S, C)]
+        found = float(part.log_ratio(at, RESIDUAL, MEANS))
+        assert found == pytest.approx(wanted[0] - wanted[1], rel=1e-9, abs=1e-12)
+        left = part.information_left(jnp.asarray(information), at, MEANS)
+        np.testing.assert_allclose(whole(np.asarray(left)), np.linalg.inv(S), atol=1e-9)
 
 
-def test_noise_of_each_number_alone_may_be_a_vector(error):
-    of_each = np.diagonal(error.varying.information)
-    by_vector, dense_too = (
-        replace(error, varying=replace(error.varying, information=W))
-        for W in (of_each, np.diag(of_each))
-    )
-    np.testing.assert_allclose(ratio(by_vector, 0.3), ratio(dense_too, 0.3), rtol=1e-12)
+@pytest.mark.parametrize("terms", LISTS.values(), ids=LISTS)
+def test_terms_that_were_integrated_out_may_be_so_again(terms, information):
+    once = marginalised(terms, information)
+    again = marginalised(once.declarations, information)
+    found, wanted = (e.log_ratio(unknowns(terms), RESIDUAL, MEANS) for e in (again, once))
+    assert float(found) == pytest.approx(float(wanted), rel=1e-9)
 
 
-@pytest.mark.parametrize("fixed", [0, 3])
-@pytest.mark.parametrize("alone", [False, True], ids=["correlated noise", "independent noise"])
-def test_modes_of_an_inferred_size_are_the_same_once_they_are_made_diagonal(
-    information, fixed, alone
-):
-    W = np.diagonal(information) if alone else information
-    whole = np.diag(W) if alone else W
-    rng = np.random.default_rng(5)
-    before, V = rng.normal(size=(fixed, 6)), rng.normal(size=(4, 6))
-    weights, strength, modes, mixing = diagonal(before, W)
-    first = ModelError(weights, strength, modes, mixing=mixing, size_name="size", size_scale=0.5)
-    error = replace(first, sized=SizedModes(*diagonal(V, W, first)[:3]))
-    C = np.linalg.inv(whole)
-    residual = np.concatenate([np.ravel(RESIDUAL["a"]), np.ravel(RESIDUAL["b"])])
-    for size in (0.0, 0.4, 2.0):
-        S = C + before.T @ before + size**2 * V.T @ V
-        expected = [multivariate_normal(np.zeros(6), each).logpdf(residual) for each in (S, C)]
-        assert float(ratio(error, size)) == pytest.approx(expected[0] - expected[1], rel=1e-10)
-        left = error.information_left(jnp.asarray(whole), jnp.array([size]), MEANS)
-        np.testing.assert_allclose(left, np.linalg.inv(S), atol=1e-10)
-    largest = error.largest(MEANS)
-    np.testing.assert_allclose(
-        largest.T @ largest, before.T @ before + 1.5**2 * V.T @ V, atol=1e-10
-    )
-    keys = jax.random.split(jax.random.key(0), 40_000)
-    drawn = jax.vmap(lambda key: error.draw(key, jnp.array([0.4]), MEANS))(keys)
-    flat = np.concatenate([np.reshape(drawn[n] - MEANS[n], (len(keys), -1)) for n in MEANS], axis=1)
-    np.testing.assert_allclose(np.cov(flat.T), before.T @ before + 0.16 * V.T @ V, atol=0.2)
+@pytest.mark.parametrize("terms", LISTS.values(), ids=LISTS)
+def test_what_is_kept_is_restored(terms, information):
+    error = marginalised(terms, information)
     back = ModelError.restore(error.arrays(), error.words)
     assert back.fingerprint == error.fingerprint
-    assert back.priors.keys() == {"size"}
-    with pytest.raises(InputError, match="'size' is inferred"):
-        error.unknowns(RESIDUAL)
+    assert back.words == error.words
+    assert (back.of_mesh, back.is_learned) == (error.of_mesh, error.is_learned)
+    assert back.priors.keys() == error.priors.keys()
+    for kept, part in ((back, error), (back.of_fem, error.of_fem)):
+        np.testing.assert_array_equal(
+            kept.log_ratio(unknowns(terms), RESIDUAL, MEANS),
+            part.log_ratio(unknowns(terms), RESIDUAL, MEANS),
+        )
+    arrays = error.arrays()
+    for name in ("weights", "modes"):
+        with pytest.raises(TypeError, match="missing"):
+            ModelError.restore({n: v for n, v in arrays.items() if n != name}, error.words)
+    with pytest.raises(TypeError, match="colour"):
+        ModelError.restore({**arrays, "colour": np.zeros(1)}, error.words)
 
 
-def test_it_is_differentiable_and_batched(error):
-    sizes = jnp.linspace(0.1, 2.0, 5)
-    slopes = jax.jit(jax.vmap(jax.grad(lambda size: ratio(error, size))))(sizes)
-    by_differences = [(ratio(error, s + 1e-5) - ratio(error, s - 1e-5)) / 2e-5 for s in sizes]
-    np.testing.assert_allclose(slopes, by_differences, rtol=1e-6)
+def test_arrays_have_the_names_that_saved_errors_have():
+    """Files of earlier versions are read by these names."""
+    diagonal, varying = ["weights", "strength", "modes"], ["modes", "shares", "sized"]
+    of_size = ["x", "log_sizes", "width", "centre", "scale"]
+    W = np.ones(6)
+
+    def names(*terms):
+        return list(marginalised(terms, W).arrays())
+
+    assert names(KNOWN) == [*diagonal, "mixing"]
+    assert names(SIZED) == [*diagonal, "mixing", *(f"sized_{n}" for n in diagonal), "size_scale"]
+    of_varying = [f"varying_{n}" for n in (*varying, "information")]
+    assert names(KNOWN, CURVE) == [*diagonal, "mixing", *of_varying, "size_scale"]
+    assert names(GAIN) == [*diagonal, "mixing", *of_varying]
+    assert names(OF_MAP) == [*diagonal, *of_size]
+    assert names(OF_MESH) == [*diagonal, *of_size, "of_mesh"]
+    # Rows of an inferred size may be between others.
+    arrays = marginalised([GAIN, CURVE], W).arrays() | {
+        "varying_sized": np.array([0.0, 1, 1, 0, 1])
+    }
+    words = marginalised([CURVE], W).words
+    back = ModelError.restore(arrays, words)
+    V = back.terms[1].at(0.4, jnp.asarray(FLAT))
+    kept = [GAIN.at(1.0, FLAT), *(size * CURVE.at(1.0, FLAT)[k] for k, size in enumerate(SIZES))]
+    np.testing.assert_allclose(V, np.vstack(kept))
+    assert back.fingerprint == ModelError.restore(back.arrays(), words).fingerprint
 
 
-def test_replicates_have_its_covariance(error):
+@pytest.mark.parametrize("name", ["known and sized", "all of a measurement", "shares and map"])
+def test_it_is_differentiable_and_batched(name, information):
+    terms = LISTS[name]
+    error = marginalised(terms, information)
+    xs = unknowns(terms) + jnp.linspace(-0.2, 0.2, 5)[:, None]
+
+    def ratio(x):
+        return error.log_ratio(x, RESIDUAL, MEANS)
+
+    slopes = jax.jit(jax.vmap(jax.grad(ratio)))(xs)
+    for x, slope in zip(xs, slopes, strict=True):
+        steps = 1e-5 * jnp.eye(len(x))
+        by_differences = [(ratio(x + step) - ratio(x - step)) / 2e-5 for step in steps]
+        np.testing.assert_allclose(slope, by_differences, rtol=1e-5, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", ["known and sized", "all of a measurement", "known and map"])
+def test_replicates_and_the_largest_errors_have_the_covariance(name):
+    terms = LISTS[name]
+    error = marginalised(terms, np.ones(6))
     keys = jax.random.split(jax.random.key(0), 40_000)
-    drawn = jax.vmap(lambda key: error.draw(key, jnp.array([0.4]), MEANS))(keys)
+    drawn = jax.vmap(lambda key: error.draw(key, unknowns(terms), MEANS))(keys)
     flat = np.concatenate([np.reshape(drawn[n] - MEANS[n], (len(keys), -1)) for n in MEANS], axis=1)
-    V = dense(error, 0.4)
-    np.testing.assert_allclose(np.cov(flat.T), V.T @ V, atol=0.2)
-    np.testing.assert_array_equal(error.largest(MEANS), dense(error, 1.5))
+    S = dense(terms, X)
+    np.testing.assert_allclose(np.cov(flat.T), S, atol=0.02 * np.abs(S).max())
+    largest = error.largest(MEANS)
+    if error.is_learned:  # as large as it was in any run
+        size = np.exp(SIZE.log_sizes.max())
+        wanted = KNOWN.modes.T @ KNOWN.modes + size**2 * OF_MAP.modes.T @ OF_MAP.modes
+    else:
+        wanted = dense(terms, (X[0], 1.5))  # three scales of its prior
+    np.testing.assert_allclose(largest.T @ largest, wanted, atol=1e-9 * np.abs(wanted).max())
 
 
-def test_arrays_of_every_part_are_restored(error, information):
-    rng = np.random.default_rng(3)
-    size = Amplitude(rng.normal(size=(9, 2)), rng.normal(size=9), 0.3, np.zeros(2), np.ones(2))
-    weights, strength, modes, _ = diagonal(error.modes, information)
-    learned = ModelError(weights, strength, modes, amplitude=size, of_mesh=True)
-    for each in (error, replace(error, varying=None), learned, replace(learned, of_mesh=False)):
-        back = ModelError.restore(each.arrays(), each.words)
-        assert back.fingerprint == each.fingerprint
-        assert back.words == each.words
-        assert (back.of_mesh, back.of_fem) == (each.of_mesh, each.of_fem)
-        assert back.priors.keys() == each.priors.keys()
-    with pytest.raises(TypeError, match="missing"):
-        ModelError.restore({"modes": modes}, {})
+def test_no_errors_change_nothing(information):
+    none = ModelError()
+    assert float(none.log_ratio(jnp.zeros(1), RESIDUAL, MEANS)) == 0.0
+    assert none.information_left(information, jnp.zeros(1), MEANS) is information
+    drawn = none.draw(jax.random.key(0), jnp.zeros(1), MEANS)
+    for name, mean in MEANS.items():
+        np.testing.assert_array_equal(drawn[name], mean)
+    assert none.largest(MEANS).shape == (0, 6)
+    assert not any((none.priors, none.names, none.is_learned, none.of_mesh))
+
+
+@pytest.mark.parametrize(
+    ("terms", "reason"),
+    [
+        ([KNOWN, SIZED], "the size 'size' is inferred"),
+        ([GAIN], "some are shares of what is predicted"),
+        ([KNOWN, OF_MAP], "the size of the forward map's error is learned"),
+    ],
+)
+def test_unknowns_of_errors_that_vary_are_not_told(terms, reason):
+    with pytest.raises(InputError, match=f"what is known of errors: {reason}"):
+        marginalised(terms, np.ones(6)).unknowns(RESIDUAL)
+
+
+HEAVY, INFERRED = cal.StudentTNoise(4.0, scale=0.1), cal.GaussianNoise(sd_scale=0.1)
+
+
+@pytest.mark.parametrize(
+    ("noise", "sizes", "needs", "message"),
+    [
+        (HEAVY, (), {}, "e: the noise of volume must be Gaussian; it is student_t"),
+        (HEAVY, (), {"gaussian": False}, None),
+        (INFERRED, (), {}, "e: the noise of volume must be of known sd; noise_sd is inferred"),
+        (INFERRED, (), {"known": False}, None),
+        (cal.GaussianNoise(sd=0.1), (SIZED.unknown_size,), {}, None),
+        (
+            cal.GaussianNoise(sd=0.1),
+            (SIZED.unknown_size, LEARNED),
+            {},
+            "e: the size 'size' is inferred .scale 0.5. and the size of the forward map's error is "
+            "learned; only one size can be unknown, by one name and scale",
+        ),
+    ],
+)
+def test_a_missing_property_has_one_wording(noise, sizes, needs, message):
+    if message is None:
+        check_algebra("e", {"volume": noise}, sizes, **needs)
+        return
+    with pytest.raises(InputError, match=message) as refusal:
+        check_algebra("e", {"volume": noise}, sizes, **needs)
+    assert "\n" not in str(refusal.value)

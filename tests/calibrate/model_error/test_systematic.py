@@ -159,6 +159,20 @@ def test_what_changes_the_likelihood_changes_the_fingerprint(model, errors):
     assert error.fingerprint != cal.with_systematic(model, errors[0]).error.fingerprint
 
 
+def test_errors_that_are_added_one_by_one_are_those_added_together(model, errors):
+    together, data = cal.with_systematic(model, *errors), some_data(model)
+    one_by_one = cal.with_systematic(cal.with_systematic(model, errors[0]), errors[1])
+    expected = float(together.map_log_likelihood(DRAW, data))
+    assert float(one_by_one.map_log_likelihood(DRAW, data)) == pytest.approx(expected, rel=1e-10)
+    means, _ = model.predict(DRAW)
+    residual = {n: data[n] - means[n] for n in data}
+    for found, wanted in zip(
+        one_by_one.error.unknowns(residual), together.error.unknowns(residual), strict=True
+    ):
+        np.testing.assert_allclose(found, wanted, atol=1e-10)
+    assert one_by_one.error.names == together.error.names
+
+
 def test_what_cannot_be(model, errors):
     with pytest.raises(InputError, match="'volume' is not observed; observed: displacement@a"):
         cal.with_systematic(model, Systematic(("bias",), {"volume": np.ones((1,))}))
@@ -166,11 +180,12 @@ def test_what_cannot_be(model, errors):
         cal.with_systematic(model, Systematic(("bias",), {"displacement@a": np.ones((1, 2))}))
     with pytest.raises(InputError, match="give one or more"):
         cal.with_systematic(model)
-    with pytest.raises(InputError, match="has an error already"):
-        cal.with_systematic(cal.with_systematic(model, *errors), *errors)
     learned = cal.model(model.full, dict(model.observe.parts), cal.GaussianNoise(sd_scale=1.0))
-    with pytest.raises(InputError, match="must be Gaussian and of known sd"):
+    with pytest.raises(InputError, match="must be of known sd; noise_sd is inferred"):
         cal.with_systematic(learned, *errors)
+    sized = Systematic(("a",), {"displacement@a": np.ones((1, 3, 3))}, ("lam", 0.1))
+    with pytest.raises(InputError, match="a size is called 'lam', as an unknown of the model"):
+        cal.with_systematic(model, sized)
     with pytest.raises(InputError, match="camera: sds -1 mm"):
         cal.rigid_motion("camera", positions(model), -1, 0.0)
 

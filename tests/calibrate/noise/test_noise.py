@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.linalg import block_diag
 from scipy.spatial.distance import cdist
 
 import calibrate as cal
@@ -14,6 +15,7 @@ from calibrate.noise import (
     CorrelatedNoise,
     Sites,
     StudentTNoise,
+    information_about_means,
     noise_of,
     parse_noise,
 )
@@ -94,6 +96,26 @@ def test_correlated_noise_is_the_multivariate_normal(kernel, gaps, strict):
     assert noise.upper_sd == pytest.approx(np.sqrt(np.linalg.eigvalsh(C).max()), rel=1e-10)
     other = CorrelatedNoise(13.0, sd=0.3, spatial_sd=0.8, kernel=kernel).at(sites)
     assert abs(float(other.distribution(jnp.asarray(mean), {}).log_prob(data)) - expected) > 1e-2
+
+
+def test_the_information_about_means_is_in_closed_form():
+    """The inverse covariance of Gaussian noise; of Student's t the curvature at the mean."""
+    sites, mean = Sites.of(POINTS, 3), jnp.asarray(MEAN)
+    heavy, values = StudentTNoise(dof=4, prior_scale=1.0), {"noise_scale": jnp.asarray(0.3)}
+    np.testing.assert_allclose(heavy.information(mean, values), np.full(18, 5.0 / (4.0 * 0.09)))
+    plain = cal.GaussianNoise(sd=0.5)
+    correlated = CorrelatedNoise(12.0, sd=0.3, spatial_sd=0.8).at(sites)
+    C = covariance(sites.positions, 12.0, "matern32", 0.3, 0.8, sites.component)
+    np.testing.assert_allclose(correlated.information(mean, {}), np.linalg.inv(C), atol=1e-9)
+    # Of several observations in the order in which their data are raveled.
+    means = {"b": mean, "a": jnp.zeros(()), "c": jnp.zeros((2, 2))}
+    together = information_about_means({"b": correlated, "a": plain, "c": plain}, means)
+    expected = block_diag(np.diag([4.0]), np.linalg.inv(C), 4.0 * np.eye(4))
+    np.testing.assert_allclose(together, expected, atol=1e-9)
+    diagonal = information_about_means(
+        {"b": heavy, "a": plain}, {n: means[n] for n in "ab"}, {"b": values}
+    )
+    np.testing.assert_allclose(diagonal, [4.0, *np.full(18, 5.0 / (4.0 * 0.09))])
 
 
 @pytest.mark.parametrize("kernel", CORRELATIONS)

@@ -105,7 +105,6 @@ MISTAKES = [
     (("turn = 1.0", 'turn = "1 degree"'), "systematic 'camera': turn = \"1 degree\"; expected"),
     (('of = "dis', 'of = "volume+dis'), "systematic 'camera': of: 'volume' is not observed"),
     (("rigid_motion", "wind"), "systematic 'camera': kind 'wind' is unknown; known: rigid_motion"),
-    (("chains = 2", "error_runs = 9"), "systematic and error_runs are both given"),
     (('"once_clamped_beam"', '"beam"'), "scene 'beam' is unknown"),
     (('"once_clamped_beam"', "beam"), "is not valid TOML"),
     (("draws = 40", 'observe = "nodes:4"'), "observe has no effect beside data"),

@@ -12,7 +12,8 @@ from scipy.stats import multivariate_normal
 
 import calibrate as cal
 import emulator as em
-from calibrate.model_error import ModelError
+from calibrate.model_error import ModelError, Systematic
+from calibrate.model_error.algebra import marginalised
 from calibrate.posterior import sample
 from calibrate.posterior.diagnosis import map_fault
 from calibrate.statistical_model import with_error
@@ -59,7 +60,7 @@ def test_the_density_is_that_of_the_sum_of_noise_and_error(aware, truth):
     data = aware.check_data(np.asarray(truth.at(NODES)(TRUTH)))
     draw = {"mu": jnp.asarray(70.0), "lam": jnp.asarray(81.0)}
     size = float(aware.error.size(jnp.array([70.0, 81.0])))
-    spread = size**2 * aware.error.modes.T @ aware.error.modes
+    spread = size**2 * aware.error.terms[0].modes.T @ aware.error.terms[0].modes
     covariance = NOISE**2 * np.eye(spread.shape[0]) + spread
     mean = np.asarray(aware.forward(jnp.array([70.0, 81.0]))).ravel()
     wanted = multivariate_normal(mean, covariance).logpdf(np.ravel(data["displacement"]))
@@ -72,7 +73,7 @@ def test_the_density_is_that_of_the_sum_of_noise_and_error(aware, truth):
 def test_what_is_left_of_the_information_is_that_of_the_sum(aware):
     """Against the inverse of the whole covariance, where the error is as large as it is there."""
     at = jnp.array([70.0, 81.0])
-    modes, size = aware.error.modes, float(aware.error.size(at))
+    modes, size = aware.error.terms[0].modes, float(aware.error.size(at))
     noise = NOISE**2 * np.eye(modes.shape[1])
     found = aware.error.information_left(jnp.asarray(np.linalg.inv(noise)), at, {})
     wanted = np.linalg.inv(noise + size**2 * modes.T @ modes)
@@ -85,9 +86,9 @@ def test_fem_on_the_mesh_shares_the_error_of_the_mesh_only(aware, truth):
     draw = {"mu": jnp.asarray(70.0), "lam": jnp.asarray(81.0)}
     means = aware.predict(draw)[0]
     size = float(aware.error.size(jnp.array([70.0, 81.0])))
-    of_noise = NOISE**2 * np.eye(aware.error.modes.shape[1])
-    of_mesh = size**2 * aware.error.modes.T @ aware.error.modes
-    whole = replace(aware, error=replace(aware.error, of_mesh=True))
+    of_noise = NOISE**2 * np.eye(aware.error.terms[0].modes.shape[1])
+    of_mesh = size**2 * aware.error.terms[0].modes.T @ aware.error.terms[0].modes
+    whole = replace(aware, error=ModelError((replace(aware.error.terms[0], of_mesh=True),)))
     mean, y = (np.ravel(d["displacement"]) for d in (means, data))
     for model, covariance in ((aware, of_noise), (whole, of_noise + of_mesh)):
         found = float(model.fem_log_likelihood(draw, means, data))
@@ -112,9 +113,11 @@ def test_the_covariance_is_that_of_the_errors():
     size = np.array([float(found.size(jnp.array(x))) for x in rng.random((20, 2))])
     middle = np.median(size) ** 2 * found.modes.T @ found.modes
     np.testing.assert_allclose(middle, root[:2].T @ root[:2], atol=0.6 * np.abs(middle).max())
-    # G is diagonal: V^T W V.
-    G = found.modes @ np.linalg.inv(noise) @ found.modes.T
-    np.testing.assert_allclose(G, np.diag(found.strength), atol=1e-9 * G.max())
+    # Integrated out they are the same, and G is diagonal: V^T W V.
+    (term,) = marginalised([found], np.linalg.inv(noise)).terms
+    G = term.modes @ np.linalg.inv(noise) @ term.modes.T
+    np.testing.assert_allclose(G, np.diag(term.strength), atol=1e-9 * G.max())
+    np.testing.assert_allclose(term.modes.T @ term.modes, found.modes.T @ found.modes, atol=1e-9)
 
 
 def test_its_size_follows_the_unknowns():
@@ -126,9 +129,55 @@ def test_its_size_follows_the_unknowns():
     low, high = (float(found.size(jnp.array([v]))) for v in (0.05, 0.95))
     assert 4.0 < high / low < 15.0
     # Far outside the runs it stays between the sizes they have.
-    assert float(found.size(jnp.array([50.0]))) <= np.exp(found.amplitude.log_sizes.max()) * (
-        1 + 1e-12
+    assert float(found.size(jnp.array([50.0]))) <= np.exp(found.size.log_sizes.max()) * (1 + 1e-12)
+
+
+def test_it_is_beside_systematic_errors(truth, poor):
+    """Against SciPy's normal: of the map with both errors, of FEM with those of the measurement."""
+    rng = np.random.default_rng(4)
+    V = 0.1 * rng.normal(size=(2, 12))
+    camera = Systematic(("a", "b"), {"displacement": V.reshape(2, 4, 3)})
+    told = cal.with_systematic(model_of(poor), camera)
+    whole = with_error(told, LinearSimulator(truth), 40)
+    learned = whole.error.terms[-1]
+    data = whole.check_data(np.asarray(truth.at(NODES)(TRUTH)))
+    draw, x = {"mu": jnp.asarray(70.0), "lam": jnp.asarray(81.0)}, jnp.array([70.0, 81.0])
+    means = whole.predict(draw)[0]
+    mean, y = (np.ravel(d["displacement"]) for d in (means, data))
+    of_fem = NOISE**2 * np.eye(12) + V.T @ V
+    of_map = of_fem + float(learned.size(x)) ** 2 * learned.modes.T @ learned.modes
+    wanted = [multivariate_normal(mean, covariance).logpdf(y) for covariance in (of_map, of_fem)]
+    assert float(whole.map_log_likelihood(draw, data)) == pytest.approx(wanted[0], rel=1e-9)
+    assert float(whole.fem_log_likelihood(draw, means, data)) == pytest.approx(wanted[1], rel=1e-9)
+    # In whichever order they are added; and what is kept is the same.
+    after = cal.with_systematic(with_error(model_of(poor), LinearSimulator(truth), 40), camera)
+    assert float(after.map_log_likelihood(draw, data)) == pytest.approx(wanted[0], rel=1e-9)
+    back = ModelError.restore(whole.error.arrays(), whole.error.words)
+    assert back.fingerprint == whole.error.fingerprint
+    residual = {"displacement": data["displacement"] - means["displacement"]}
+    np.testing.assert_array_equal(
+        back.log_ratio(x, residual, means), whole.error.log_ratio(x, residual, means)
     )
+    assert not back.of_mesh
+    assert len(back.of_fem.terms) == 1
+    gain = Systematic(("gain",), {}, shares={"displacement": np.full((1, 4, 3), 0.1)})
+    with_gain = with_error(cal.with_systematic(told, gain), LinearSimulator(truth), 40)
+    of_gain = 0.01 * np.outer(mean, mean)
+    for model in (with_gain, with_error(with_gain, LinearSimulator(truth), 40)):
+        found = float(model.map_log_likelihood(draw, data))
+        wanted_too = multivariate_normal(mean, of_map + of_gain).logpdf(y)
+        assert found == pytest.approx(wanted_too, rel=1e-9)
+        by_fem = float(model.fem_log_likelihood(draw, means, data))
+        wanted_too = multivariate_normal(mean, of_fem + of_gain).logpdf(y)
+        assert by_fem == pytest.approx(wanted_too, rel=1e-9)
+    # A second error of the map takes the place of the first; one of unknown size has no place.
+    again = with_error(whole, LinearSimulator(truth), 40)
+    assert float(again.map_log_likelihood(draw, data)) == pytest.approx(wanted[0], rel=1e-9)
+    sized = cal.with_systematic(
+        told, Systematic(("c",), {"displacement": np.ones((1, 4, 3))}, ("c", 0.1))
+    )
+    with pytest.raises(InputError, match="only one size can be unknown, by one name and scale"):
+        with_error(sized, LinearSimulator(truth), 40)
 
 
 def test_a_poor_map_widens_the_posterior_instead_of_moving_it(truth, poor, aware):
@@ -141,7 +190,7 @@ def test_a_poor_map_widens_the_posterior_instead_of_moving_it(truth, poor, aware
         right, _ = closed_form(truth, NODES, y.reshape(-1, 3), NOISE, MEAN, SD)
         # The posterior of the aware model is Gaussian but for the size: taken at the truth.
         size = float(aware.error.size(jnp.asarray(theta)))
-        error = size**2 * aware.error.modes.T @ aware.error.modes
+        error = size**2 * aware.error.terms[0].modes.T @ aware.error.terms[0].modes
         for name, spread in (("blind", 0.0 * error), ("aware", error)):
             precision = np.linalg.inv(NOISE**2 * np.eye(len(A)) + spread)
             C = np.linalg.inv(B.T @ precision @ B + np.diag(SD**-2.0))
@@ -169,7 +218,7 @@ def test_an_exact_map_changes_nothing(truth):
     model = with_error(model_of(truth), LinearSimulator(truth), 10)
     data = model.check_data(np.asarray(truth.at(NODES)(TRUTH)))
     draw = {"mu": jnp.asarray(70.0), "lam": jnp.asarray(81.0)}
-    plain = replace(model, error=None).map_log_likelihood(draw, data)
+    plain = replace(model, error=ModelError()).map_log_likelihood(draw, data)
     assert float(model.map_log_likelihood(draw, data)) == pytest.approx(float(plain), rel=1e-9)
 
 
@@ -192,7 +241,7 @@ def test_what_is_refused(truth, poor, cube):
         with_error(model, LinearSimulator(linear_forward(cube)), 10)
     observe = cal.nodal_displacements(poor.scene, NODES)
     unknown = cal.model(poor, observe, cal.GaussianNoise(sd_scale=0.1))
-    with pytest.raises(InputError, match="the noise of displacement must be Gaussian and of known"):
+    with pytest.raises(InputError, match="the noise of displacement must be of known sd; noise_sd"):
         with_error(unknown, LinearSimulator(truth), 10)
     nowhere = cal.model(
         replace(poor, limit=10.0), observe, cal.GaussianNoise(sd=0.1), check_scale=False

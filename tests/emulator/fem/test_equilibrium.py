@@ -102,6 +102,7 @@ def ventricle():
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_sensitivities_against_central_differences(ventricle):
     """Every entry of theta, the pressure among them."""
     scene = ventricle.scene

@@ -21,6 +21,7 @@ def test_the_law_is_eleven_frames_from_the_call():
     assert len(frames) <= 11
 
 
+@pytest.mark.optimised
 def test_patch_test():
     """An affine displacement of the surface is an affine displacement throughout."""
     H = 0.2 * np.random.default_rng(0).normal(size=(3, 3))
@@ -35,6 +36,7 @@ def test_patch_test():
     np.testing.assert_allclose(u, scene.mesh.nodes @ H.T, atol=1e-12)
 
 
+@pytest.mark.optimised
 def test_a_hanging_block_carries_its_weight():
     """Reactions at the support balance the load: equilibrium of the whole body."""
     scene = block(loads=(Gravity(density=5.0, direction=(0.3, -0.2, -1.0)),))
@@ -46,6 +48,7 @@ def test_a_hanging_block_carries_its_weight():
     np.testing.assert_array_equal(u[scene.mesh.node_set("left")], 0.0)
 
 
+@pytest.mark.optimised
 def test_the_solution_minimises_the_energy(beam, simulator):
     u = simulator(beam.centre)
     Pi = em.potential_energy(beam)
@@ -73,6 +76,7 @@ def test_tangent_is_the_derivative_of_the_residual(simulator, beam):
     )
 
 
+@pytest.mark.optimised
 def test_gradient_in_theta_against_central_differences(beam, simulator):
     theta = beam.theta(mu=63.0, lam=88.0)
     weights = jnp.asarray(np.random.default_rng(2).normal(size=beam.held.shape))
@@ -94,6 +98,7 @@ def test_taylor_remainder_in_theta(beam, simulator):
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_vmap_equals_one_at_a_time(beam, simulator):
     thetas = beam.from_unit(jnp.asarray(np.random.default_rng(0).uniform(size=(4, 2))))
     together = jax.vmap(simulator.solve)(thetas)
@@ -114,6 +119,7 @@ def test_a_warm_start_saves_iterations_and_changes_nothing(beam, simulator):
     assert simulator.solve(beam.centre, cold.displacement).iterations == 0
 
 
+@pytest.mark.optimised
 def test_newton_converges_quadratically(beam, simulator):
     system, theta = simulator.system, beam.centre
     u = simulator(theta) + jnp.where(beam.held, 0.0, 0.02)
@@ -125,6 +131,7 @@ def test_newton_converges_quadratically(beam, simulator):
     assert errors[-1] < 1e-10
 
 
+@pytest.mark.optimised
 def test_prescribed_displacements_are_met_exactly(cube):
     solution = em.Simulator(cube).solve(cube.centre)
     assert solution.converged

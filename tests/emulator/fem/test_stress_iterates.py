@@ -83,6 +83,7 @@ def test_equilibrium_is_a_fixed_point(ventricle):
     np.testing.assert_allclose(after.measures, state.measures, atol=1e-10)
 
 
+@pytest.mark.optimised
 def test_it_converges_quadratically(ventricle):
     own, errors = mip(ventricle, ventricle.centre), []
     state, step = own.begin(jnp.zeros(ventricle.held.shape)), jax.jit(own.step)
@@ -246,6 +247,7 @@ def test_with_mean_dilatation_they_converge_quadratically(dilated):
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_with_mean_dilatation_they_end_where_newton_does(dilated):
     scene = dilated
     ramps, volumes = (
