@@ -49,7 +49,7 @@ from jax.flatten_util import ravel_pytree
 
 from calibrate.noise.protocol import PLAUSIBLE
 from emulator.core.errors import InputError
-from emulator.core.gaussian_process import eliminated
+from emulator.core.small_matrices import eliminate
 from emulator.surrogates.protocol import fingerprint_of
 
 Means = Mapping[str, jax.Array]
@@ -244,7 +244,7 @@ class ModelError:
         flat, _ = ravel_pytree(dict(means))
         V = self.varying.at(self._inferred_size(unknowns), flat)
         VW = self.varying.weighted(V)
-        more = eliminated(VW @ V.T + jnp.eye(len(V)), VW @ columns)
+        more = eliminate(VW @ V.T + jnp.eye(len(V)), VW @ columns)
         return jnp.concatenate([pivots, more[0]]), jnp.concatenate([rows, more[1]])
 
     def _inferred_size(self, unknowns: jax.Array) -> jax.Array | float:

@@ -194,31 +194,3 @@ def mean(
     return matern72(squared) @ value_weights + along @ derivative_weights.reshape(
         count * width, outputs
     )
-
-
-def eliminated(matrix: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
-    r"""Return the pivots p (r,) and the reduced rows R (r, m), by elimination without exchanges.
-
-    :math:`M = L P L^T` with a unit lower triangular L and pivots :math:`P = \mathrm{diag}(p)`. Then
-    :math:`|M| = \prod_k p_k`, and with :math:`R = L^{-1} A`
-
-    .. math:: A^T M^{-1} A = R^T P^{-1} R .
-
-    Plain arithmetic, which may be batched: ``jax.vmap`` of ``jnp.linalg.solve``, ``inv``, ``det``
-    and ``cholesky`` of small matrices has been seen to hang on processors of few cores.
-
-    matrix : the positive definite matrix M, (r, r).
-    rows : A, (r, m).
-    """
-    later = jnp.arange(len(matrix))
-
-    def step(
-        state: tuple[jax.Array, jax.Array], k: jax.Array
-    ) -> tuple[tuple[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
-        M, R = state
-        pivot, row = M[k, k], R[k]
-        factor = jnp.where(later > k, M[:, k] / pivot, 0.0)
-        return (M - factor[:, None] * M[k], R - factor[:, None] * row), (pivot, row)
-
-    reduced: tuple[jax.Array, jax.Array] = jax.lax.scan(step, (matrix, rows), later)[1]
-    return reduced
