@@ -49,6 +49,7 @@ from jax.flatten_util import ravel_pytree
 
 from calibrate.noise.protocol import PLAUSIBLE
 from emulator.core.errors import InputError
+from emulator.core.gaussian_process import kernel_mean
 from emulator.core.small_matrices import eliminate
 from emulator.surrogates.protocol import fingerprint_of
 
@@ -83,8 +84,8 @@ class Amplitude:
     def __call__(self, unknowns: jax.Array) -> jax.Array:
         """Return the size, (), at ``unknowns`` (q,): between the least and greatest of the runs."""
         at = (unknowns - self.centre) / self.scale
-        log_weights = -0.5 * jnp.sum(((at - self.x) / self.width) ** 2, axis=-1)
-        return jnp.exp(jax.nn.softmax(log_weights) @ self.log_sizes)
+        squared = jnp.sum(((at - self.x) / self.width) ** 2, axis=-1)
+        return jnp.exp(kernel_mean(squared, self.log_sizes))
 
 
 @jax.tree_util.register_dataclass
