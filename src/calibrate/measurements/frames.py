@@ -26,7 +26,8 @@ from calibrate.measurements.surface import SurfacePoints
 from calibrate.measurements.volume import CavityVolume
 from calibrate.state_names import in_state, split
 from emulator.core.errors import InputError
-from emulator.geometry.facets import MM3_PER_ML, enclosed_volume, encloses, openings, rim
+from emulator.core.units import MM3_PER_ML
+from emulator.geometry.facets import enclosed_volume, encloses, openings, rim
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.surfaces import Surface
 from emulator.scenes.scene import Scene, cavity_sets

@@ -18,12 +18,12 @@ from typing import NamedTuple
 import numpy as np
 
 from emulator.core.errors import InputError, look_up
+from emulator.core.units import IN_MM
 from emulator.geometry.discretisation import mesh_quality
 from emulator.geometry.facets import mean_normal
 from emulator.geometry.fibres import BOTH
 from emulator.geometry.io import Body, read_body, write_mesh
 from emulator.geometry.mesh import EDGES, Mesh, cross_sides
-from emulator.geometry.surfaces import UNITS
 from emulator.mechanics.laws import find_law
 from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.file import read_scene
@@ -107,7 +107,7 @@ def draft_scene(
     if out.exists():
         raise InputError(f"{out} is there already; remove it or give --out another name")
     if unit is not None:
-        look_up(UNITS, unit, "unit")
+        look_up(IN_MM, unit, "unit")
     if law is not None:
         find_law(law)  # refused before anything is written
     body = read_body(mesh_path)
@@ -168,7 +168,7 @@ def _in_mm(body: Body, path: Path, out: Path, unit: str, notes: list[str]) -> tu
         folder, path = out.resolve().parent, path.resolve()
         name = path.relative_to(folder) if path.is_relative_to(folder) else path
         return body, name.as_posix()
-    mesh = replace(body.mesh, nodes=UNITS[unit] * body.mesh.nodes)
+    mesh = replace(body.mesh, nodes=IN_MM[unit] * body.mesh.nodes)
     target = out.with_name(f"{path.stem}_mm.vtu")
     if target.exists():
         raise InputError(f"{target}, the mesh in mm, is there already; remove it")
