@@ -1,22 +1,31 @@
 r"""Where a point lies: in which element of a body, and over which facet of a surface.
 
 **In the body.** scikit-fem finds the element of a point inside the body. A point outside, or inside
-a curved element but not inside its straight-edged one, is moved onto the nearest element, by
-inverting the element's map :math:`x(\xi) = \sum_a N_a(\xi)\, X_a` with Newton's method.
+a curved element but not inside its straight-edged one, is moved onto the nearest element.
 
 **On a surface.** The closest point of a triangle is the foot of the perpendicular to its plane, or,
-where the foot lies outside, the closest point of the three edges. On curved facets
-:math:`x(\xi) = \sum_a N_a(\xi)\, X_a` that is the start of Gauss-Newton iterations on
-:math:`|x(\xi) - p|^2`.
+where the foot lies outside, the closest point of the three edges. On curved facets that is the
+start of a search.
+
+**Closest point of a curved element or facet.** Its barycentric coordinates are positive and add up
+to 1: :math:`\lambda_i = s_i^2 / |s|^2`. With :math:`x(\lambda) = \sum_a N_a(\lambda)\, X_a` and
+the element's size h, Newton's method (:mod:`emulator.core.small_newton`) finds
+
+.. math:: \min_s \; \frac{|x(\lambda(s)) - p|^2}{2 h^2} + \frac{(|s|^2 - 1)^2}{2} .
+
+The second term fixes the length of s, and is zero at the minimum.
 """
 
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from skfem import MeshTet
 
 from calibrate.measurements.observation import LENGTH_UNITS
 from emulator.core.errors import InputError
+from emulator.core.small_newton import minimise_by_newton
 from emulator.geometry.discretisation import shapes_at
 from emulator.geometry.mesh import Mesh
 
@@ -28,8 +37,13 @@ _LEAST, _MOST = 0.003, 5.0  # limits of the span, in sizes of the body
 _ON_THE_FACE = 1e-9  # round-off of a barycentric coordinate
 _ELEMENTS = 32  # nearest straight-edged elements that are searched for a point
 _FACETS = 16  # nearest facets of a surface that are searched for a point
-_NEWTON_STEPS = 12  # largest number of steps; an element with straight edges takes one
-_GAUSS_NEWTON_STEPS = 20  # the distance of a point on the surface converges quadratically
+_OFF_EDGE = 0.02  # least barycentric coordinate at which a search starts
+# Corners at the ends of the edges (2, e) that the middle nodes of quadratic facets and elements lie
+# on, in the order of the nodes.
+_EDGES = {
+    6: np.array([[0, 1, 2], [1, 2, 0]]),
+    10: np.array([[0, 1, 0, 0, 1, 2], [1, 2, 2, 3, 3, 3]]),
+}
 
 
 def locate(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -43,15 +57,21 @@ def locate(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     elements, coordinates = [], []
     for k, point in enumerate(points):
         try:
-            element = finder(*point[:, None])
-            inside = _invert(nodes[element], point)[0]
-            is_inside = bool(inside.min() >= -_ON_THE_FACE)
+            (element,) = finder(*point[:, None])
         except ValueError:  # outside every straight-edged element
             is_inside = False
+        else:
+            inside = _straight_coordinates(nodes[[element], :4], point)
+            if mesh.order == 2:
+                inside, (distance,) = _closest(nodes[[element]], inside, point)
+                is_inside = distance <= _ON_THE_FACE * mesh.size
+            else:
+                is_inside = inside.min() >= -_ON_THE_FACE
+            inside = inside[0]
         if not is_inside:
             element, inside = _nearest(mesh, k, point)
-        elements.append(int(element[0]))
-        coordinates.append(inside[0])
+        elements.append(int(element))
+        coordinates.append(inside)
     return np.array(elements), np.array(coordinates)
 
 
@@ -78,62 +98,75 @@ def _check_extent(mesh: Mesh, points: np.ndarray) -> None:
     )
 
 
-def _invert(X: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return barycentric coordinates (c, 4) of ``point`` in elements with nodes ``X`` (c, a, 3).
-
-    They are not clipped: a coordinate below 0 says that the point lies beyond a face. Their
-    gradients (c, 4, 3) in space, 1/mm, are returned, too.
-    """
-    order = 1 if X.shape[1] == 4 else 2
-    xi = np.full((len(X), 3), 0.25)
-    for _ in range(1 if order == 1 else _NEWTON_STEPS):
-        values, slopes = shapes_at(order, _barycentric(xi))
-        # d xi / d x, the inverse of the element map's Jacobian; JAX's batched LAPACK is slower.
-        inverse = np.linalg.inv(np.einsum("cai,caj->cij", X, slopes))
-        step = np.einsum("cji,ci->cj", inverse, point - np.einsum("ca,cai->ci", values, X))
-        # Far outside a curved element its map folds: Newton's method stays close to the element.
-        xi = xi + step if order == 1 else np.clip(xi + step, -0.5, 1.5)
-        if np.abs(step).max() < 1e-13:
-            break
-    return _barycentric(xi), np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)
-
-
-def _barycentric(xi: np.ndarray) -> np.ndarray:
-    return np.concatenate([1.0 - xi.sum(axis=1, keepdims=True), xi], axis=1)
-
-
-def _nearest(mesh: Mesh, k: int, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the element nearest to ``point``, and the barycentric coordinates (1, 4) on it."""
-    every = mesh.nodes[mesh.elements]
-    distances, _ = _onto(every[:, :4], point)
-    candidates = np.argsort(distances, kind="stable")[:_ELEMENTS]
-    distances, inside = _onto(every[candidates], point)
+def _nearest(mesh: Mesh, k: int, point: np.ndarray) -> tuple[int, np.ndarray]:
+    """Return the element nearest to ``point``, and the barycentric coordinates (4,) there."""
+    nodes = mesh.nodes[mesh.elements]
+    coordinates = _straight_coordinates(nodes[:, :4], point)
+    inside = np.maximum(coordinates, 0.0)
+    inside /= inside.sum(axis=1, keepdims=True)
+    gaps = np.linalg.norm(np.einsum("ca,cai->ci", inside, nodes[:, :4]) - point, axis=1)
+    candidates = np.argsort(gaps, kind="stable")[:_ELEMENTS]
+    inside, distances = _closest(nodes[candidates], inside[candidates], point)
     best = int(np.argmin(distances))
     if not distances[best] <= _SLACK * mesh.size:
         raise InputError(
             f"landmark {k} at {point.tolist()} mm lies outside the body, "
             f"about {distances[best]:.2g} mm away"
         )
-    return candidates[[best]], inside[[best]]
+    return int(candidates[best]), inside[best]
 
 
-def _onto(X: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the element's closest points to ``point``: distances (c,), coordinates (c, 4).
+def _straight_coordinates(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """Return barycentric coordinates (c, 4), some below 0 outside, in tetrahedra (c, 4, 3)."""
+    sides = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+    # NumPy solves the systems, because JAX's batched LAPACK is slow on small ones.
+    last = np.linalg.solve(sides, (point - corners[:, 0])[..., None])[..., 0]
+    return np.concatenate([1.0 - last.sum(axis=1, keepdims=True), last], axis=1)
 
-    The barycentric coordinates are those of the point moved onto the element: from beyond a face
-    along its normal; coordinates that are still below 0 are clipped.
+
+def _closest(X: np.ndarray, start: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the closest points to ``point`` (3,): coordinates (c, k) and distances (c,).
+
+    X : the nodes (c, a, 3) of elements (k = 4) or facets (k = 3), linear or quadratic.
+    start : barycentric coordinates (c, k) at which the search starts.
     """
-    coordinates, gradients = _invert(X, point)
-    rows = np.arange(len(X))
-    lowest = np.argmin(coordinates, axis=1)
-    normal = gradients[rows, lowest]
-    beyond = np.minimum(coordinates[rows, lowest], 0.0) / np.sum(normal**2, axis=1)
-    inside = coordinates - beyond[:, None] * np.einsum("cai,ci->ca", gradients, normal)
-    inside = np.maximum(inside, 0.0)
-    inside /= inside.sum(axis=1, keepdims=True)
-    shapes, _ = shapes_at(1 if X.shape[1] == 4 else 2, inside)
-    positions = np.einsum("ca,cai->ci", shapes, X)
-    return np.linalg.norm(positions - point, axis=1), inside
+    inside, distances = _closest_program(X, start, point)
+    return np.asarray(inside), np.asarray(distances)
+
+
+@jax.jit
+def _closest_program(
+    X: jax.Array, start: jax.Array, point: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    def closest(X: jax.Array, start: jax.Array) -> tuple[jax.Array, jax.Array]:
+        size = jnp.max(jnp.ptp(X, axis=0))
+
+        def barycentric(s: jax.Array) -> jax.Array:
+            return s**2 / jnp.sum(s**2)
+
+        def gap(s: jax.Array) -> jax.Array:
+            return (_shapes(barycentric(s), len(X)) @ X - point) / size
+
+        def function(s: jax.Array) -> jax.Array:
+            return 0.5 * jnp.sum(gap(s) ** 2) + 0.5 * (jnp.sum(s**2) - 1.0) ** 2
+
+        def quadratic(s: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+            return *jax.value_and_grad(function)(s), jax.hessian(function)(s)
+
+        # The slope along a coordinate that is 0 is 0, too: the search could not leave an edge.
+        begin = jnp.sqrt(jnp.maximum(start, _OFF_EDGE))
+        s = minimise_by_newton(quadratic, begin / jnp.linalg.norm(begin)).x
+        return barycentric(s), size * jnp.linalg.norm(gap(s))
+
+    return jax.vmap(closest)(X, start)
+
+
+def _shapes(barycentric: jax.Array, nodes: int) -> jax.Array:
+    """Return the shape functions (a,) at barycentric coordinates (k,) of a simplex."""
+    if nodes == len(barycentric):
+        return barycentric
+    ends = barycentric[_EDGES[nodes]]
+    return jnp.concatenate([barycentric * (2.0 * barycentric - 1.0), 4.0 * ends[0] * ends[1]])
 
 
 def closest_point(facets: np.ndarray, point: np.ndarray) -> tuple[int, np.ndarray]:
@@ -145,7 +178,7 @@ def closest_point(facets: np.ndarray, point: np.ndarray) -> tuple[int, np.ndarra
     candidates = np.arange(len(facets))
     if facets.shape[1] == 6:
         candidates = np.argsort(distances, kind="stable")[:_FACETS]
-        coordinates, distances = _onto_curved(facets[candidates], coordinates[candidates], point)
+        coordinates, distances = _closest(facets[candidates], coordinates[candidates], point)
     best = int(np.argmin(distances))
     return int(candidates[best]), coordinates[best]
 
@@ -186,21 +219,3 @@ def _onto_triangles(corners: np.ndarray, point: np.ndarray) -> tuple[np.ndarray,
     distances[0, points[0].min(axis=1) < 0.0] = np.inf  # beyond an edge
     best, rows = np.argmin(distances, axis=0), np.arange(len(corners))
     return points[best, rows], distances[best, rows]
-
-
-def _onto_curved(
-    facets: np.ndarray, barycentric: np.ndarray, point: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return closest points on quadratic facets (f, 6, 3), from a start on straight ones."""
-    for _ in range(_GAUSS_NEWTON_STEPS):
-        values, slopes = facet_shapes(barycentric, 6)
-        offset = point - np.einsum("fa,fai->fi", values, facets)
-        tangents = np.einsum("fad,fai->fdi", slopes, facets)
-        gram = np.einsum("fdi,fei->fde", tangents, tangents)
-        right = np.einsum("fdi,fi->fd", tangents, offset)
-        step = np.linalg.solve(gram, right[..., None])[..., 0]
-        clipped = np.maximum(barycentric + np.column_stack([-step.sum(axis=1), step]), 0.0)
-        barycentric = clipped / clipped.sum(axis=1, keepdims=True)
-    values, _ = facet_shapes(barycentric, 6)
-    positions = np.einsum("fa,fai->fi", values, facets)
-    return barycentric, np.linalg.norm(positions - point, axis=1)

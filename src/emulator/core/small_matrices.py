@@ -43,7 +43,7 @@ def eliminate(
         if modify:
             pivot = jnp.maximum(jnp.abs(pivot), least)
         factor = jnp.where(later > k, M[:, k] / pivot, 0.0)
-        return (M - factor[:, None] * M[k], R - factor[:, None] * row), (pivot, row)
+        return (M - jnp.outer(factor, M[k]), R - jnp.outer(factor, row)), (pivot, row)
 
     reduced: tuple[jax.Array, jax.Array]
     reduced = jax.lax.scan(step, (matrix, rows), later, unroll=len(matrix) <= _FEW)[1]
