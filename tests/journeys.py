@@ -1,14 +1,15 @@
-"""How many of this project's frames lie between a call and the equation it comes to.
+"""How much of the source a reader goes through between a call and the equation it comes to.
 
-``python -m tests.journeys`` prints the frames and the files of each journey in
-:data:`JOURNEYS`. A journey is the call stack at the moment the equation is first evaluated,
-cut to the frames whose code is in ``src/``.
+``python -m tests.journeys`` prints each journey in :data:`JOURNEYS`: the frames that are open
+where the equation is first evaluated, and the files entered on the way, by a call that has ended or
+not. Both count what is in ``src/``; imports do not count.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import FrameType
@@ -40,14 +41,27 @@ def stack(frame: FrameType | None) -> list[Frame]:
     return frames[::-1]
 
 
-def journey(owner: object, name: str, call: Callable[[], object]) -> list[Frame]:
-    """Return the frames from ``call`` to the first call of the function ``owner.name``.
+class Journey(NamedTuple):
+    """The open frames at the equation, and the files entered on the way, in order."""
+
+    frames: list[Frame]
+    files: list[str]
+
+
+def journey(owner: object, name: str, call: Callable[[], object]) -> Journey:
+    """Return the way from ``call`` to the first call of the function ``owner.name``.
 
     The function is replaced on the way, so ``owner`` may be a class, a module or an object.
     """
     original = getattr(owner, name)
     file = str(Path(original.__code__.co_filename).relative_to(SRC))
     frames: list[Frame] = []
+    files: dict[str, None] = {}
+
+    def enter(frame: FrameType, event: str, _: object) -> None:
+        code = frame.f_code
+        if event == "call" and code.co_name != "<module>" and code.co_filename.startswith(str(SRC)):
+            files.setdefault(str(Path(code.co_filename).relative_to(SRC)))
 
     def arrive(*_: object, **__: object) -> object:
         frames.extend([*stack(sys._getframe(1)), Frame(file, original.__qualname__)])
@@ -56,16 +70,20 @@ def journey(owner: object, name: str, call: Callable[[], object]) -> list[Frame]
     replace = type.__setattr__ if isinstance(owner, type) else object.__setattr__
     replace(owner, name, arrive)
     try:
-        call()
-    except Reached:
-        pass
+        with suppress(Reached):
+            call()  # imports what the way needs, so that decorators and registries do not count
+        frames.clear()
+        sys.setprofile(enter)
+        with suppress(Reached):
+            call()
     finally:
+        sys.setprofile(None)
         replace(owner, name, original)
-    return frames
+    return Journey(frames, list(files))
 
 
-def solve() -> list[Frame]:
-    """Return the frames from ``Simulator.solve`` to the strain energy of the law."""
+def solve() -> Journey:
+    """Return the way from ``Simulator.solve`` to the strain energy of the law."""
     import emulator as em
 
     scene = em.scenes.once_clamped_beam(cells=(2, 1, 1), order=1)
@@ -91,15 +109,15 @@ def infer(then: Callable[[str], object] = lambda _: None) -> None:
         then(f"{folder}/run")
 
 
-def parse() -> list[Frame]:
-    """Return the frames from ``calibrate infer`` to the reader of its CSV file."""
+def parse() -> Journey:
+    """Return the way from ``calibrate infer`` to the reader of its CSV file."""
     from calibrate.measurements import data
 
     return journey(data, "read_csv", infer)
 
 
-def likelihood() -> list[Frame]:
-    """Return the frames from ``calibrate infer`` to the distribution of the data."""
+def likelihood() -> Journey:
+    """Return the way from ``calibrate infer`` to the distribution of the data."""
     from calibrate.statistical_model import Model
 
     return journey(Model, "distributions", infer)
@@ -114,8 +132,8 @@ parameters = {mu = {unit = "kPa", range = [5.0, 20.0]}}
 """
 
 
-def scene_file() -> list[Frame]:
-    """Return the frames from ``calibrate simulate file.toml`` to the construction of its scene."""
+def scene_file() -> Journey:
+    """Return the way from ``calibrate simulate file.toml`` to the construction of its scene."""
     from calibrate.cli import main
     from emulator.geometry.generators.box import box
     from emulator.geometry.io import write_mesh
@@ -129,39 +147,64 @@ def scene_file() -> list[Frame]:
         return journey(Scene, "__post_init__", lambda: main(words))
 
 
-def check() -> list[Frame]:
-    """Return the frames from ``calibrate certify`` to the FEM solve."""
+def check() -> Journey:
+    """Return the way from ``calibrate certify`` to the FEM solve."""
     import emulator as em
     from calibrate.cli import main
 
-    frames: list[Frame] = []
+    ways: list[Journey] = []
 
     def certify(folder: str) -> None:
         words = ["--no-cache", "certify", folder, "--draws", "25", "--no-mesh"]
-        frames.extend(journey(em.Simulator, "solve", lambda: main(words)))
+        ways.append(journey(em.Simulator, "solve", lambda: main(words)))
 
     infer(certify)
-    return frames
+    return ways[0]
 
 
-JOURNEYS: dict[str, Callable[[], list[Frame]]] = {
-    "scene TOML to Scene": scene_file,
-    "Simulator.solve to law.energy": solve,
-    "calibrate infer to the data file": parse,
-    "calibrate infer to the likelihood": likelihood,
-    "calibrate certify to Simulator.solve": check,
+STATES = "stretch_x,stress_x [kPa]\n1.05,0.9\n1.10,2.0\n1.15,3.4\n1.20,5.2\n"
+
+
+def specimen() -> Journey:
+    """Return the way from the table of a uniaxial test to the distribution of its data."""
+    from calibrate.cli import main
+    from calibrate.statistical_model import Model
+
+    with TemporaryDirectory() as folder:
+        table = Path(folder) / "test.csv"
+        table.write_text(STATES)
+        main(["--no-cache", "init", str(table), "--out", f"{folder}/scene.toml"])
+        words = [
+            "--no-cache",
+            "infer",
+            f"{folder}/scene.toml",
+            "--no-certify",
+            "--out",
+            f"{folder}/run",
+        ]
+        words.append("--force")
+        return journey(Model, "distributions", lambda: main(words))
+
+
+JOURNEYS: dict[str, tuple[int, Callable[[], Journey]]] = {
+    "scene TOML to Scene": (16, scene_file),
+    "Simulator.solve to law.energy": (11, solve),
+    "calibrate infer to the data file": (29, parse),
+    "calibrate infer to the likelihood": (73, likelihood),
+    "table of a specimen to the likelihood": (76, specimen),
+    "calibrate certify to Simulator.solve": (66, check),
 }
-"""Journeys by what they lead from and to."""
+"""Journeys by what they lead from and to, each with the most files that it may enter."""
 
 
 def main() -> None:
-    """Print the frames and the number of files of each journey."""
-    for name, travel in JOURNEYS.items():
-        frames = travel()
-        files = {frame.file for frame in frames}
-        print(f"{name}: {len(frames)} frames in {len(files)} files")
+    """Print the frames of each journey, and the files entered."""
+    for name, (most, travel) in JOURNEYS.items():
+        frames, files = travel()
+        print(f"{name}: {len(frames)} frames; {len(files)} files entered (at most {most})")
         for frame in frames:
             print(f"  {frame.file:44} {frame.function}")
+        print("  entered:", ", ".join(files))
 
 
 if __name__ == "__main__":

@@ -56,6 +56,13 @@ def words_of_comparisons_and_lists():
     ]  # fmt: skip
 
 
+def test_the_page_is_read_in_one_sitting():
+    lines = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= 200
+    cells = [cell for line in lines if line.startswith("|") for cell in line.split("|")]
+    assert max(map(len, cells)) <= 200
+
+
 def test_every_path_of_the_table_exists():
     for paths in rows().values():
         for path in paths:

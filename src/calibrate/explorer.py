@@ -167,7 +167,7 @@ class Explorer:
         return jax.jit(self._curve.volumes)
 
 
-class _Handler(Handler):
+class _PageHandler(Handler):
     """Answers one request to the explorer, the server's subject."""
 
     def do_GET(self) -> None:
@@ -192,4 +192,4 @@ class _Handler(Handler):
 
 def serve(explorer: Explorer, port: int = 0) -> Server:
     """Return a server on the loopback address, ready for ``serve_forever``; port 0 is any."""
-    return listen(_Handler, explorer, port)
+    return listen(_PageHandler, explorer, port)

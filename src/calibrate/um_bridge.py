@@ -92,7 +92,7 @@ def serve(
     port : the port to listen on, which no other program has; 0 takes a free one.
     host : the loopback address, or one that other machines reach, without a password.
     """
-    return listen(_Handler, ForwardModel(forward, observe), port, host)
+    return listen(_BridgeHandler, ForwardModel(forward, observe), port, host)
 
 
 class _Fault(Exception):
@@ -103,7 +103,7 @@ class _Fault(Exception):
         self.kind = kind
 
 
-class _Handler(Handler):
+class _BridgeHandler(Handler):
     def do_GET(self) -> None:
         """Answer with the protocol's version and the model's name."""
         if self.is_foreign() or self.path != "/Info":

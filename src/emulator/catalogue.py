@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from emulator.core.errors import InputError
-from emulator.released.scenes import published_scene
 from emulator.scenes.built_in import BUILT_IN
 from emulator.scenes.file import read_scene
 from emulator.scenes.finer import CHANGES, FINER, Finer, finer
@@ -37,6 +36,8 @@ def find_scene(name: str, root: str | Path | None = None) -> Scene:
     if name.startswith(_RELEASED):
         if root is None:
             raise InputError(f"scene '{name}': say where the published data is with --root DIR")
+        from emulator.released.scenes import published_scene  # a room
+
         return published_scene(name.removeprefix(_RELEASED), root)
     if name.endswith(".toml"):
         return read_scene(name)

@@ -19,7 +19,7 @@ from studies.effects.scenes import SCENES, observed, other_choices, points, publ
 
 import calibrate as cal
 import emulator as em
-from calibrate.analysis.effects import Comparison, Measured, recommend
+from calibrate.analysis.effects import Measured, WithoutTerms, recommend
 from calibrate.figures import BLUE, GREEN, VERMILION, pyplot
 from calibrate.measurements import CavityVolume, Observations, landmarks, spread_landmarks
 from calibrate.samplers import NUTSOptions
@@ -112,7 +112,7 @@ def one_scene(name: str, results: Results, *, quick: bool) -> None:
         parts["published pressure, linear elements"] = (linear, lambda: published(scene))
     data: dict[str, np.ndarray] = {}
     comparisons = {
-        id(whole): Comparison(whole, observed(whole, at), SAMPLES, SEED)
+        id(whole): WithoutTerms(whole, observed(whole, at), SAMPLES, SEED)
         for whole in (scene, linear)
     }
 

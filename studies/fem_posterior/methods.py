@@ -170,7 +170,7 @@ def by_tuned_fem(
     data = problem.fem.check_data(problem.data)
     drawn = {name: jnp.asarray(values) for name, values in posterior.draws().items()}
     map_ = transport.fit_standard(np.asarray(jax.jit(jax.vmap(density.unconstrain))(drawn)))
-    programs = compile_chains(NUTS, density, options)
+    programs = compile_chains(density, NUTS, options)
     keys = jax.random.split(jax.random.key(seed), sizes.chains)
     states, _ = programs.start(keys, data, map_)
     # One length of both, so that one program serves.

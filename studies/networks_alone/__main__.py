@@ -34,9 +34,9 @@ from emulator.fem import Runs, run_campaign, sobol
 from emulator.scenes import Scene
 from emulator.surrogates import Architecture, Emulator, load, shipped
 from emulator.training.mode_fit import ModeFit, scales_of
-from emulator.training.network_plan import Problem, with_weights
+from emulator.training.network_plan import PreparedTraining, with_weights
 from emulator.training.optimiser import NetworkTraining, clipped_adam
-from emulator.training.physics import ARCHITECTURE, Physics
+from emulator.training.physics import ARCHITECTURE, PhysicsPlan
 from emulator.training.plan import Job
 
 HERE = Path(__file__).parent
@@ -119,7 +119,7 @@ IDEAS = (
 def trained(idea: Idea, scene: Any, seed: int, arguments: argparse.Namespace) -> Emulator:
     """The emulator that ``idea`` leads to."""
     steps, runs = arguments.steps, arguments.simulations
-    plan = Physics(sweeps=0, steps=steps, simulations=runs, seed=seed)
+    plan = PhysicsPlan(sweeps=0, steps=steps, simulations=runs, seed=seed)
     plan = idea.plan(replace(plan, polish=arguments.polish))
     problem = plan.prepare(Job(scene, SMALL if arguments.quick else ARCHITECTURE))
     training = _with(idea, problem, plan.polish)
@@ -129,7 +129,7 @@ def trained(idea: Idea, scene: Any, seed: int, arguments: argparse.Namespace) ->
     return with_weights(problem.emulator, training.finish(state.weights, False))
 
 
-def _with(idea: Idea, problem: Problem, polish: int) -> NetworkTraining:
+def _with(idea: Idea, problem: PreparedTraining, polish: int) -> NetworkTraining:
     scene, runs = problem.emulator.scene, problem.runs
     scales = scales_of(scene, runs)
     fit = idea.fit(ModeFit(scene, problem.training.network, runs, scales))

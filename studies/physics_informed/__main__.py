@@ -37,7 +37,7 @@ from emulator.scenes.loads import PublishedPressure
 from emulator.surrogates import Architecture, Emulator, save_emulator
 from emulator.surrogates.taylor import expand
 from emulator.training import recipe, train
-from emulator.training.physics import Physics
+from emulator.training.physics import PhysicsPlan
 from emulator.training.sweeps import polynomial_part, sweep_box
 
 HERE = Path(__file__).parent
@@ -145,7 +145,7 @@ def network(scene: Scene, known: Runs, name: str, keep: Path | None, given: Any)
     """The network that a recipe trains in so many minutes, and a posterior with it."""
     small = given.quick
     plan = replace(recipe(name), seed=given.seed)
-    sizes = SMALL if small and isinstance(plan, Physics) else None
+    sizes = SMALL if small and isinstance(plan, PhysicsPlan) else None
     if small:
         plan = plan.with_counts(steps=60, simulations=20, polish=50)
     with tempfile.TemporaryDirectory() as folder:

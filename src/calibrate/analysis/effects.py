@@ -123,7 +123,7 @@ def recommend(
     effects = effects_of(scene)
     if not effects:
         raise InputError(f"scene '{scene.name}' has no effect that it can do without")
-    compared = Comparison(scene, observation_points, samples, seed, say)
+    compared = WithoutTerms(scene, observation_points, samples, seed, say)
     alone = [compared.without((name,)) for name in effects]
     chosen: tuple[str, ...] = ()
     best = compared.without(())
@@ -137,7 +137,7 @@ def recommend(
     trials = 0
     while chosen:
         trials += 1
-        judge = Comparison(
+        judge = WithoutTerms(
             scene, observation_points, samples, seed + trials * _HELD_OUT, say, compared.simulators
         )
         judged = judge.without(chosen)
@@ -183,7 +183,7 @@ def tolerances(words: Sequence[str], observe: Observations) -> dict[str, float]:
     return {name: by_unit[unit] for name, unit in units.items()}
 
 
-class Comparison:
+class WithoutTerms:
     """Solves simpler scenes at the theta of one design and compares them with the whole one.
 
     simulators : the simulators so far, by the effects left out; new ones are added.

@@ -193,7 +193,7 @@ def expected_precision(
     return {"sd": dict(zip(names, ratio.tolist(), strict=True)), "combinations": best}
 
 
-class _Programs:
+class _DataPrograms:
     """What a model predicts at unknowns x (q,), each function compiled once for all data sets."""
 
     def __init__(self, model: Model) -> None:
@@ -251,7 +251,7 @@ def _posterior_covariances(
     model: Model, errors: Errors, prior: np.ndarray, before: np.ndarray, count: int, seed: int
 ) -> np.ndarray:
     """Return posterior covariances (r, q, q) given data made at draws of the prior's x (s, q)."""
-    programs, shared = _Programs(model), prior[count:][:_FROM_PRIOR]
+    programs, shared = _DataPrograms(model), prior[count:][:_FROM_PRIOR]
     means, valid = programs.answers(prior[:count])
     rows = _some(valid)
     truths, means = prior[rows], {name: mean[rows] for name, mean in means.items()}

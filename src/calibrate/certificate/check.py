@@ -36,7 +36,7 @@ import numpy as np
 
 from calibrate.certificate.estimates import Tests, evidence_of
 from calibrate.certificate.mesh import mesh_change
-from calibrate.certificate.runs import Runs, Solver, correction_from, descend
+from calibrate.certificate.runs import FEMRunner, FEMRuns, correction_from, descend
 from calibrate.certificate.verdict import Certificate, judge
 from calibrate.importance.proposals import MOST_TEMPERED, Kernels, key_from, tempered
 from calibrate.importance.weights import effective, normalised
@@ -120,7 +120,7 @@ def examine(
         one_blas_thread(),
         counting(total=count, desc="FEM check", disable=not progress, unit="run") as bar,
     ):
-        solver = Solver(predictive, FEMLikelihood(posterior.model, simulator), bar)
+        solver = FEMRunner(predictive, FEMLikelihood(posterior.model, simulator), bar)
         with stages("FEM where the map was asked"):
             rows = np.linspace(0, len(z) - 1, max(round(_AT_DRAWS * count), 5)).astype(int)
             at_draws = solver(z[rows], stability=_STABILITY)
@@ -133,13 +133,13 @@ def examine(
             # Only descents of FEM's own misfit lead to a mode that the map hides altogether.
             descending = max(round(_DESCENTS * count), min(_FEWEST_DESCENTS, count // 6))
             descents, modes = descend(solver, at_prior, at_draws, z, descending, rng)
-        training, total = Runs.joined([at_draws, around, at_prior, descents]), count
+        training, total = FEMRuns.joined([at_draws, around, at_prior, descents]), count
         with stages("correction, and FEM that tests it"):
             while True:
                 training, pool = _train(solver, z, training, modes, count, most, rng)
                 rows, log_drawn = pool.tests(total - len(training.z), rng)
                 tests = Tests(pool, solver(pool.z[rows]), rows, log_drawn)
-                runs = Runs.joined([training, tests.runs])
+                runs = FEMRuns.joined([training, tests.runs])
                 evidence = evidence_of(posterior, at_draws, training, tests, len(modes), rng)
                 count = _further_runs(total, most)
                 if judge(evidence).verdict != "undecided" or not count:
@@ -176,14 +176,14 @@ def _checked_counts(draws: int | None, at_most: int | None, mesh: int | None) ->
 
 
 def _train(
-    solver: Solver,
+    solver: FEMRunner,
     z: np.ndarray,
-    runs: Runs,
+    runs: FEMRuns,
     modes: tuple[np.ndarray, ...],
     count: int,
     most: int,
     rng: np.random.Generator,
-) -> tuple[Runs, Pool]:
+) -> tuple[FEMRuns, Pool]:
     """Return all training runs, and the pool under the correction fitted to them.
 
     Of ``count`` runs adaptive ones are a share; the whole check has ``most`` at most.
@@ -195,7 +195,7 @@ def _train(
         chances = tempered(pool.log_explored, MOST_TEMPERED)
         if chances.any():
             points = pool.z[rng.choice(len(pool.z), size=size, p=chances)]
-            runs = Runs.joined([runs, solver(points)])
+            runs = FEMRuns.joined([runs, solver(points)])
         pool = pool.corrected_by(correction_from(runs, predictive, most))
         if effective(normalised(pool.log_explored)) < MOST_TEMPERED:
             pool = pool.stepped(pool.log_explored, rng)

@@ -34,7 +34,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from calibrate.certificate.evidence import LARGEST_MASS, Changes, Evidence, Figure, Physics, Tail
-from calibrate.certificate.runs import Runs, least_likely
+from calibrate.certificate.runs import FEMRuns, least_likely
 from calibrate.importance.proposals import key_from
 from calibrate.importance.weights import effective, normalised, pareto_shape
 from calibrate.posterior import Posterior
@@ -60,7 +60,7 @@ class Tests:
     """
 
     pool: Pool
-    runs: Runs
+    runs: FEMRuns
     rows: np.ndarray
     log_drawn: np.ndarray
 
@@ -112,8 +112,8 @@ def jackknife(
 
 def evidence_of(
     posterior: Posterior,
-    at_draws: Runs,
-    training: Runs,
+    at_draws: FEMRuns,
+    training: FEMRuns,
     tests: Tests,
     modes: int,
     rng: np.random.Generator,
@@ -127,7 +127,7 @@ def evidence_of(
     modes : the number of further modes of FEM that descents have found.
     """
     pool, figures = tests.pool, figures_of(posterior, tests)
-    missed = missed_by(tests, Runs.joined([training, tests.runs]))
+    missed = missed_by(tests, FEMRuns.joined([training, tests.runs]))
     means, valid = pool.predictive.means(at_draws.z)
     errors = (means - at_draws.means)[valid & at_draws.converged]
     z = pool.z[pool.resampled(_DRAWS, rng)]
@@ -227,7 +227,7 @@ def sampling_of(posterior: Posterior) -> Sampling:
     )
 
 
-def physics_of(at_draws: Runs, training: Runs, tests: Tests) -> Physics:
+def physics_of(at_draws: FEMRuns, training: FEMRuns, tests: Tests) -> Physics:
     """Return the outcome of the FEM runs; failures count by the posterior mass they stand for."""
     failed = int((~training.converged).sum() + (~tests.runs.converged).sum())
     share = normalised(tests.log_corrected) * len(tests.rows)
@@ -244,7 +244,7 @@ def physics_of(at_draws: Runs, training: Runs, tests: Tests) -> Physics:
     )
 
 
-def missed_by(tests: Tests, runs: Runs) -> int:
+def missed_by(tests: Tests, runs: FEMRuns) -> int:
     r"""Return the number of runs around which FEM may have a mode that no test would meet.
 
     Such a run is likely by FEM (within the density that bounds 99 % of a Gaussian at the best run)

@@ -30,8 +30,8 @@ from calibrate.certificate.evidence import (
     MeshChange,
     all_within,
 )
-from calibrate.certificate.runs import Runs
-from calibrate.statistical_model.finer_fem import Finer, FinerFEM, finer_fem
+from calibrate.certificate.runs import FEMRuns
+from calibrate.statistical_model.finer_fem import FinerFEM, MeshPair, finer_fem
 from calibrate.statistical_model.pool import Pool
 from calibrate.statistical_model.predictive import (
     Correction,
@@ -78,7 +78,7 @@ def points_for(unknowns: int, states: int, most: int | None) -> tuple[int, int]:
 def mesh_change(
     pool: Pool,
     simulator: Simulator,
-    runs: Runs,
+    runs: FEMRuns,
     count: int | None,
     rng: np.random.Generator,
     *,
@@ -136,7 +136,7 @@ def _differences_of_fem(predictive: Predictive, finer: FinerFEM, bar: tqdm) -> D
     """
     known: list[MeshErrorEstimate] = []
 
-    def difference(draw: Mapping[str, Any]) -> Finer | None:
+    def difference(draw: Mapping[str, Any]) -> MeshPair | None:
         try:
             return finer(draw, known)
         except SolverError:
@@ -158,7 +158,7 @@ def _differences_of_fem(predictive: Predictive, finer: FinerFEM, bar: tqdm) -> D
 def change_by(
     differences: Differences,
     pool: Pool,
-    runs: Runs,
+    runs: FEMRuns,
     points: tuple[int, int],
     rng: np.random.Generator,
     *,
@@ -234,7 +234,7 @@ def _change(
     return value, np.hypot(error, np.sqrt(variance))
 
 
-def _corrections_by(predictive: Predictive, runs: Runs) -> CorrectionBy:
+def _corrections_by(predictive: Predictive, runs: FEMRuns) -> CorrectionBy:
     """Return the function from points z (k, p) and differences (k, m) to two corrections.
 
     The first one is the map's to FEM on the finer mesh, or without points to FEM on the mesh; the

@@ -52,7 +52,7 @@ def least_likely(best: float, dimension: int, mass: float) -> float:
     return best - 0.5 * float(chdtri(dimension, 1.0 - mass))
 
 
-class Runs(NamedTuple):
+class FEMRuns(NamedTuple):
     """FEM at points z (s, p).
 
     fem : log likelihoods (s,), ``-inf`` where FEM did not converge.
@@ -80,7 +80,7 @@ class Runs(NamedTuple):
         return self.fem > least_likely(self.fem.max(), self.z.shape[1], _LIKELY)
 
     @classmethod
-    def joined(cls, parts: Iterable[Runs]) -> Runs:
+    def joined(cls, parts: Iterable[FEMRuns]) -> FEMRuns:
         """Return the runs of all parts, one part after the other."""
         *arrays, stable, slopes = zip(*parts, strict=True)
         joined = map(np.concatenate, arrays)
@@ -88,7 +88,7 @@ class Runs(NamedTuple):
 
 
 @dataclass
-class Solver:
+class FEMRunner:
     """Solves FEM at points, each point once.
 
     bar : the progress bar that counts the runs.
@@ -101,7 +101,7 @@ class Solver:
     def __post_init__(self) -> None:
         self._known: dict[bytes, Likelihoods] = {}
 
-    def __call__(self, z: np.ndarray, *, stability: int = 0, slopes: bool = False) -> Runs:
+    def __call__(self, z: np.ndarray, *, stability: int = 0, slopes: bool = False) -> FEMRuns:
         """Return FEM at points (s, p).
 
         stability : the number of points, the first ones, at which stability is examined.
@@ -122,7 +122,7 @@ class Solver:
                 self.bar.update()
         runs = [self._known[key] for key in keys]
         missing = np.full(len(self.predictive.scales), np.nan)
-        return Runs(
+        return FEMRuns(
             z,
             np.array([f.fem if np.isfinite(f.fem) else -np.inf for f in runs]),
             np.array([ravel_pytree(f.means)[0] if f.converged else missing for f in runs]),
@@ -132,7 +132,7 @@ class Solver:
         )
 
 
-def correction_from(runs: Runs, predictive: Predictive, rows: int) -> Correction:
+def correction_from(runs: FEMRuns, predictive: Predictive, rows: int) -> Correction:
     """Return the correction fitted to ``runs``, padded to ``rows`` points."""
     means, valid = predictive.means(runs.z)
     x = predictive.features(runs.z)
@@ -158,7 +158,7 @@ class _Descent:
     promise: float
 
     @classmethod
-    def from_run(cls, predictive: Predictive, runs: Runs, k: int) -> _Descent | None:
+    def from_run(cls, predictive: Predictive, runs: FEMRuns, k: int) -> _Descent | None:
         """Return a descent at run ``k``; none where FEM did not converge or has no slopes."""
         slopes = runs.slopes[k]
         if slopes is None or not np.isfinite(runs.fem[k]):
@@ -173,13 +173,13 @@ class _Descent:
 
 
 def descend(
-    solver: Solver,
-    starts: Runs,
-    at_draws: Runs,
+    solver: FEMRunner,
+    starts: FEMRuns,
+    at_draws: FEMRuns,
     draws: np.ndarray,
     count: int,
     rng: np.random.Generator,
-) -> tuple[Runs, tuple[np.ndarray, ...]]:
+) -> tuple[FEMRuns, tuple[np.ndarray, ...]]:
     """Search modes of FEM's posterior away from the draws, with at most ``count`` FEM runs.
 
     Return the runs, and points (_, p) around each further mode of FEM.
@@ -205,7 +205,7 @@ def descend(
 
     candidates = (_Descent.from_run(predictive, starts, k) for k in range(len(starts.z)))
     descents = {k: d for k, d in enumerate(candidates) if d is not None}
-    parts = [Runs._make(column[:0] for column in starts)]
+    parts = [FEMRuns._make(column[:0] for column in starts)]
     remaining, width = count, max(-(-count // ROUNDS), 1)
     while remaining:
         targets = {k: d.target for k, d in descents.items()}
@@ -224,7 +224,7 @@ def descend(
             descents[k] = trial
     points = {k: d.z for k, d in descents.items() if d.log_posterior > least}
     ends = [descents[k] for k in away(points)]
-    return Runs.joined(parts), _points_around(ends, sd, rng)
+    return FEMRuns.joined(parts), _points_around(ends, sd, rng)
 
 
 def _points_around(

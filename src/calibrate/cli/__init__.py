@@ -9,7 +9,6 @@ Commands only translate words into a call of the library and its result into tex
 from __future__ import annotations
 
 import hashlib
-import importlib
 import os
 import platform
 import sys
@@ -22,6 +21,7 @@ import jax
 from calibrate.cli.words import Parser
 from emulator import __version__
 from emulator.core.errors import InputError, SolverError
+from emulator.core.rooms import missing_room, offered
 from emulator.core.store import to_json
 
 DONE, FAILED, BAD_INPUT = 0, 1, 2
@@ -77,8 +77,8 @@ def build_parser(only: str | None = None) -> Parser:
         dest="command", required=True, metavar="COMMAND", parser_class=Parser
     )
     for name in COMMANDS if only is None else [only]:
-        module = importlib.import_module(f"calibrate.cli.commands.{COMMANDS[name]}")
-        getattr(module, name)(commands, name)
+        for add in offered(f"calibrate.cli.commands.{COMMANDS[name]}", name):
+            add(commands, name)
     return parser
 
 
@@ -104,6 +104,11 @@ def main(words: Sequence[str] | None = None) -> int:
     except SolverError as error:
         print(f"calibrate: {error}", file=sys.stderr)
         return FAILED
+    except ModuleNotFoundError as error:
+        if (message := missing_room(error)) is None:
+            raise
+        print(f"calibrate: {message}", file=sys.stderr)
+        return BAD_INPUT
     except OSError as error:
         what = f"{error.filename}: {error.strerror}" if error.filename else str(error)
         print(f"calibrate: cannot read or write {what}", file=sys.stderr)

@@ -120,11 +120,10 @@ def plan_of(arguments: Namespace) -> Run | Problem | Members:
 
 def problem_of(arguments: Namespace) -> Problem:
     """Return the problem of :func:`plan_of`; :class:`InputError` if it is of members."""
-    from calibrate.project import read_problem
-    from calibrate.project.members import Members
+    from calibrate.project import Problem, Run, read_problem
 
     plan = plan_of(arguments)
-    if isinstance(plan, Members):
+    if not isinstance(plan, Run | Problem):
         raise InputError(
             f"{arguments.scene} has members of a population; give an experiment file of one of them"
         )

@@ -31,7 +31,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -54,6 +53,7 @@ from calibrate.population.model import (
 )
 from calibrate.statistical_model import Data
 from calibrate.statistical_model.density import Target, threads_for
+from emulator.core.kept import kept
 from emulator.core.small_matrices import eliminate
 
 
@@ -138,7 +138,7 @@ class PopulationDensity(Target):
     values: Callable[..., dict[str, jax.Array]]
 
 
-@lru_cache(maxsize=4)
+@kept
 def density_of_population(model: PopulationModel) -> PopulationDensity:
     """Return the density of the posterior of population and members, up to a constant."""
     sites = handlers.trace(handlers.seed(model, jax.random.key(0))).get_trace()

@@ -104,8 +104,7 @@ class Posterior(TableRepr):
             if not np.isfinite(value):
                 raise InputError(f"prediction: {name} is {value}; give a finite number")
             thetas = thetas.at[:, scene.parameter_names.index(name)].set(value)
-        key: Any = (self.model.full, observe)
-        outputs = predictions.outputs_of(*key)
+        outputs = predictions.outputs_of(observe, self.model.full)
         return outputs.values(thetas).reshape(-1, *observe.shape)
 
     def summary(self, probability: float = 0.9) -> Summary:

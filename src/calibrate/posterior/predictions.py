@@ -19,7 +19,7 @@ judges the shape alone.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -35,6 +35,7 @@ from calibrate.measurements.volume import pressure_volume
 from calibrate.noise.correlated import SpatialNormal
 from calibrate.statistical_model import Data, Model
 from emulator.core.errors import InputError, check_known, check_seed
+from emulator.core.kept import kept
 from emulator.surrogates.fem import FEMForward
 from emulator.surrogates.protocol import ForwardMap, Prediction
 
@@ -66,13 +67,13 @@ def log_likelihood(
     means : data without noise (chains, draws, *shape), where the draws are not of the model's own
         posterior; by its forward map otherwise.
     """
-    terms = _over_draws(_log_likelihood, model)((_flat(draws), _flat(means)), data)
+    terms = _over_draws(model, _log_likelihood)((_flat(draws), _flat(means)), data)
     return _unflat(terms, draws)
 
 
-@lru_cache(maxsize=4)
-def outputs_of(forward: ForwardMap, observe: Observation) -> Outputs:
-    """Return the outputs; cached, so that a loop over pressures compiles once."""
+@kept
+def outputs_of(observe: Observation, forward: ForwardMap) -> Outputs:
+    """Return the outputs; kept, so that a loop over pressures compiles once."""
     return Outputs(forward, {"observed": observe})
 
 
@@ -84,7 +85,7 @@ def replicates(
     ``means`` as of :func:`log_likelihood`.
     """
     keys = jax.random.split(rng_key, next(iter(draws.values())).size)
-    return _unflat(_over_draws(_replicate, model)((_flat(draws), _flat(means), keys)), draws)
+    return _unflat(_over_draws(model, _replicate)((_flat(draws), _flat(means), keys)), draws)
 
 
 def prior_replicates(model: Model, rng_key: jax.Array, count: int = REPLICATES) -> Prior:
@@ -96,7 +97,7 @@ def prior_replicates(model: Model, rng_key: jax.Array, count: int = REPLICATES) 
     if isinstance(model.forward, FEMForward):
         prior = _solved_prior(model, model.forward, keys)
     else:
-        prior = _over_draws(_prior, model)((keys,))
+        prior = _over_draws(model, _prior)((keys,))
     draws, data, valid = jax.tree.map(np.asarray, prior)
     rows = np.flatnonzero(valid)[:count]
     return Prior(*({n: values[rows] for n, values in by.items()} for by in (draws, data)))
@@ -173,8 +174,8 @@ def _replicate(
     return {name: trace[_site(name)]["value"] for name in model.observe.parts}
 
 
-@lru_cache(maxsize=12)
-def _over_draws(function: Callable[..., Any], model: Model) -> Callable[..., Any]:
+@kept
+def _over_draws(model: Model, function: Callable[..., Any]) -> Callable[..., Any]:
     """Return the program of ``function(model, *one, *rest)`` over many draws, and the rest.
 
     It takes one draw after the other: maps that solve gain nothing from being vectorised.

@@ -39,16 +39,15 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
 
 from pydantic import Field, create_model
 
 from calibrate.model_error.kinds import SYSTEMATIC_ERRORS
 from calibrate.noise import NOISES
 from calibrate.priors.population import BOX, POPULATIONS, Population
-from calibrate.project.members import POPULATION, Members, Shared
 from calibrate.project.problem import Problem, naming, read_problem
-from calibrate.project.results import MEMBERS
+from calibrate.project.results import MEMBERS, POPULATION
 from calibrate.project.run import SYNTHETIC, Run, with_absolute_paths
 from calibrate.samplers import SAMPLERS
 from emulator.core import schema
@@ -56,6 +55,9 @@ from emulator.core.errors import InputError
 from emulator.core.gaussian_process import CORRELATIONS
 from emulator.core.schema import OneOf, Table, documented, json_schema, table_of
 from emulator.surrogates.registry import FORWARD_MAPS, forward_kind, known_options
+
+if TYPE_CHECKING:
+    from calibrate.project.members import Members
 
 _OF_A_MEMBER = ("data", "truth", "known", "observe")
 
@@ -103,6 +105,8 @@ def read_experiment(path: str | Path, entries: Mapping[str, Any] = {}) -> Proble
         if POPULATION in file:
             raise InputError(f"{file_name}: [population] is of members; give [members.NAME], too")
         return problem(file, lines, file_name)
+    from calibrate.project.members import Members, Shared  # a room
+
     for name in _OF_A_MEMBER:
         if name in entries:
             raise InputError(f"--{name} has no effect with {path}: it is of one member")
@@ -135,6 +139,8 @@ def _without(table: Mapping[str, Any], entries: Mapping[str, Any]) -> dict[str, 
 
 def experiment_schema() -> dict[str, Any]:
     """Return the schema (draft 2020-12). It admits what the reader admits of any scene and data."""
+    from calibrate.project.members import Members, Shared  # a room
+
     run: Any = _entries()
     about = documented(Members)
     tables: dict[str, Any] = {

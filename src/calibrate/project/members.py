@@ -24,6 +24,7 @@ from calibrate.project.problem import Problem, read_problem, with_data
 from calibrate.project.results import (
     CERTIFICATE,
     MEMBERS,
+    POPULATION,
     POSTERIOR,
     REPORT,
     RUN,
@@ -41,7 +42,6 @@ from emulator.core import schema
 from emulator.core.errors import InputError
 from emulator.core.store import read_json, write_json
 
-POPULATION = "population"
 SHRINKAGE = "shrinkage.png"
 _SAME_MODEL = (
     "scene_fingerprint", "forward_fingerprint", "forward_error", "observe", "noise", "prior",

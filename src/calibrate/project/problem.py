@@ -28,31 +28,23 @@ from calibrate.statistical_model.load_states import boxed, known_thetas, load_st
 from calibrate.statistical_model.model import model
 from emulator.catalogue import find_scene
 from emulator.core.errors import InputError
+from emulator.core.kept import kept
 from emulator.fem import NewtonOptions, Simulator
 from emulator.scenes.scene import Scene
 from emulator.surrogates import registry
 from emulator.surrogates.fem import fem_forward
 from emulator.surrogates.protocol import ForwardMap, Ingredients
 
-_SIMULATORS: dict[tuple[str, int], Simulator] = {}  # the one used last at the end
-_MOST_SIMULATORS = 2  # each holds a scene's mesh and the compiled programs
 
-
+@kept
 def simulator_of(scene: Scene, load_steps: int = 1) -> Simulator:
-    """Return this process's simulator of ``scene``, found by the scene's fingerprint.
+    """Return the simulator of ``scene``, which the scene keeps.
 
     A simulator compiles its programs when it first solves, which takes longer than the solve.
-    Synthetic data, the forward map, the certificate and the report of a run therefore share one
-    simulator, even where each of them has built the scene anew.
+    Synthetic data, the forward map, the certificate and the report of a run share one, as they
+    share the scene.
     """
-    key = (scene.fingerprint, load_steps)
-    simulator = _SIMULATORS.pop(key, None)
-    if simulator is None:
-        simulator = Simulator(scene, NewtonOptions.load_steps(load_steps))
-    _SIMULATORS[key] = simulator
-    if len(_SIMULATORS) > _MOST_SIMULATORS:
-        del _SIMULATORS[next(iter(_SIMULATORS))]
-    return simulator
+    return Simulator(scene, NewtonOptions.load_steps(load_steps))
 
 
 @dataclass(frozen=True, eq=False)

@@ -44,6 +44,7 @@ RUN, DATA, POSTERIOR, CERTIFICATE = "run.json", "data.csv", "posterior.nc", "cer
 FORWARD, ERROR = "forward.safetensors", "error.safetensors"
 REPORT = "report.html"
 SAMPLING = "sampling.safetensors"  # checkpoint of a run that has not ended
+POPULATION = "population"  # entry of what members share in run.json and in experiment files
 MEMBERS = "members"  # entry of a population's members in run.json, and folder of their runs
 
 _RESULTS = (REPORT, CERTIFICATE, POSTERIOR, FORWARD, ERROR)  # files of a run that has ended

@@ -26,8 +26,8 @@ from calibrate.population.posterior import CORRELATION
 from calibrate.posterior import read_tree
 from calibrate.posterior.diagnosis import misfits
 from calibrate.project.calibration import NOT_CERTIFIED
-from calibrate.project.members import POPULATION, Members, Shared, verdicts_in
-from calibrate.project.results import MEMBERS, POSTERIOR, REPORT
+from calibrate.project.members import Members, Shared, verdicts_in
+from calibrate.project.results import MEMBERS, POPULATION, POSTERIOR, REPORT
 from calibrate.report import charts, parts
 from calibrate.report.charts import translucent
 from calibrate.report.parts import Verdict

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -38,6 +38,7 @@ from calibrate.samplers.protocol import ChainOptions, Context, Draws, Kernel, Sa
 from calibrate.statistical_model.density import Density, Target, prior_draws
 from emulator.core.display import counting
 from emulator.core.errors import SolverError
+from emulator.core.kept import kept
 
 _CHUNK = 50  # iterations between two updates of the progress bar
 _CANDIDATES = 16  # starting points tried, for forward maps that are not valid everywhere
@@ -132,8 +133,8 @@ class Programs:
             return list(pool.map(one, chains))
 
 
-@lru_cache(maxsize=4)
-def compile_chains(sampler: ChainSampler, density: Target, options: ChainOptions) -> Programs:
+@kept
+def compile_chains(density: Target, sampler: ChainSampler, options: ChainOptions) -> Programs:
     """Return the programs of a density in straightened coordinates; data and map are arguments."""
 
     def log_density(w: jax.Array, data: Any, map_: StandardMap) -> jax.Array:
@@ -183,7 +184,7 @@ class Chains:
         self.density, self.data, self.options = density, data, options
         self.checkpoint = context.checkpoint
         self.bar = counting(desc=sampler.name, total=0, disable=not context.progress)
-        self.programs = compile_chains(sampler, density, options)
+        self.programs = compile_chains(density, sampler, options)
         self._warmup = options.warmup if sampler.adapts_in_steps else 0
         wanted = max(_PILOT_DRAWS, 10 * coefficient_count(density.dimension))
         # In whole chunks: a part of one would be compiled on its own.

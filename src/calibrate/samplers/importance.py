@@ -40,7 +40,6 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from threading import Lock
 from typing import Any, ClassVar
 
 import numpy as np
@@ -64,6 +63,7 @@ from calibrate.samplers.modes import (
     merged,
     missed_mode,
     of_account,
+    programs_of,
     shares,
     unseen,
 )
@@ -84,7 +84,6 @@ _MOST_STEPS = 25
 _PATIENCE = 3  # steps after which a population looks for modes by the gradient
 # Attributes of a run: modes that one population alone saw, and the number that none may have seen.
 SEEN_ONCE, UNSEEN = "modes_seen_once", "modes_unseen"
-_ONE_CLIMBS = Lock()  # at a time, so that the gradient is compiled once
 _FITS, _MOST_FITS = 2, 6
 _LIGHT = 0.5  # Pareto shape of the weights of a good fit: their variance is finite
 _CHOSEN = 1024  # points that the kernels of a step are put around
@@ -170,7 +169,7 @@ class _Run:
         prior, *steps = self._starts
         of_steps = np.stack(steps, axis=1).reshape(-1, self._density.dimension)[:MOST]
         starts = np.stack([prior, of_steps], axis=1).reshape(-1, self._density.dimension)[:MOST]
-        with _ONE_CLIMBS:
+        with programs_of(self._density).climbing:
             self.modes = explore(self._density, self._data, starts, self._starts[-1])
 
     def settle(self) -> None:

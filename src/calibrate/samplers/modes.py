@@ -22,7 +22,7 @@ the test is conservative: draws on a bent ridge look heavier than they are.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from functools import lru_cache
+from threading import Lock
 from typing import Any, NamedTuple
 
 import jax
@@ -32,6 +32,7 @@ from scipy.linalg import solve_triangular
 
 from calibrate.statistical_model import Data
 from calibrate.statistical_model.density import Density
+from emulator.core.kept import kept
 from emulator.core.minimise import minimise
 
 # Attributes of a run: the log of the draws' mass over the missed mode's, infinite if none is
@@ -63,18 +64,22 @@ class _DensityPrograms(NamedTuple):
 
     value_and_gradient : (z (p,), data) -> log density (), gradient (p,).
     heights : (z (s, p), data) -> log densities (s,).
+    climbing : the lock of a thread that climbs: one at a time, so that the gradient is compiled
+        once.
     """
 
     value_and_gradient: Callable[..., Any]
     heights: Callable[..., Any]
+    climbing: Lock
 
 
-@lru_cache(maxsize=4)
+@kept
 def programs_of(density: Density) -> _DensityPrograms:
-    """Return the compiled functions of a density, which the last few densities keep."""
+    """Return the compiled functions of a density, which the density keeps."""
     return _DensityPrograms(
         jax.jit(jax.value_and_grad(density.log_density)),
         jax.jit(lambda z, data: jax.lax.map(lambda row: density.log_density(row, data), z)),
+        Lock(),
     )
 
 

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 from operator import itemgetter
 from typing import Any, ClassVar, NamedTuple
 
@@ -34,6 +33,7 @@ from calibrate.statistical_model import Data
 from calibrate.statistical_model.density import Density
 from emulator.core.display import counting
 from emulator.core.errors import SolverError
+from emulator.core.kept import kept
 
 # Log likelihood of particles where the forward map has no answer. Finite, because its product with
 # a temperature of 0 must be 0; so low that such particles die out at the first step.
@@ -161,7 +161,7 @@ class _SMCPrograms(NamedTuple):
     finish: Callable[..., Any]  # (particles (k, n, p), data) -> log densities (k, n)
 
 
-@lru_cache(maxsize=4)
+@kept
 def _compile(density: Density, options: SMCOptions) -> _SMCPrograms:
     import blackjax  # only some samplers need this import
     from blackjax.smc import base, resampling

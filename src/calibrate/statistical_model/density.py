@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -20,6 +20,7 @@ from numpyro.distributions.transforms import biject_to
 from numpyro.infer.util import potential_energy
 
 from calibrate.statistical_model.model import Data, Model
+from emulator.core.kept import kept
 from emulator.core.machine import cores
 from emulator.fem.campaign import at_once
 from emulator.surrogates.corrected import CorrectedForward
@@ -72,7 +73,7 @@ class Density(Target):
     batches: bool = True
 
 
-@lru_cache(maxsize=4)
+@kept
 def density_of(model: Model) -> Density:
     """Return the density of a model's posterior, up to a constant."""
     names = tuple(sorted(model.sampled_priors))
@@ -135,7 +136,7 @@ def heights(density: Density, z: np.ndarray, data: Data) -> Heights:
     return in_blocks(partial(_height_program(density), data=data), z)
 
 
-@lru_cache(maxsize=4)
+@kept
 def _height_program(density: Density) -> Callable[..., Heights]:
     def one(z: jax.Array, data: Data) -> Heights:
         prior, likelihood = density.log_prior(z), density.log_likelihood(z, data)
@@ -144,7 +145,7 @@ def _height_program(density: Density) -> Callable[..., Heights]:
     return jax.jit(lambda z, data: jax.lax.map(partial(one, data=data), z, batch_size=BATCH))
 
 
-@lru_cache(maxsize=4)
+@kept
 def _prior_program(density: Density) -> Callable[..., jax.Array]:
     return jax.jit(jax.vmap(lambda key: density.prior_draw(jax.random.wrap_key_data(key))))
 

@@ -23,7 +23,7 @@ from emulator.surrogates.gripped import GrippedSpecimen
 Known = Sequence[MeshErrorEstimate]
 
 
-class Finer(NamedTuple):
+class MeshPair(NamedTuple):
     """Data (m,) without noise at one draw, all observations raveled.
 
     fine : of the FEM that is closer to the measurement.
@@ -49,7 +49,7 @@ class FinerFEM(Protocol):
         """The number of draws that are solved at once."""
         ...
 
-    def __call__(self, draw: Mapping[str, Any], known: Known = ()) -> Finer:
+    def __call__(self, draw: Mapping[str, Any], known: Known = ()) -> MeshPair:
         """Return the data at ``draw``; :class:`SolverError` where FEM does not converge.
 
         known : fields of earlier draws, from which solves may start.
@@ -97,13 +97,13 @@ class _OnFinerMesh:
     def workers(self) -> int:
         return at_once(self.error.simulator, self.nodes)
 
-    def __call__(self, draw: Mapping[str, Any], known: Known = ()) -> Finer:
+    def __call__(self, draw: Mapping[str, Any], known: Known = ()) -> MeshPair:
         """Return the data; solves start from ``known`` and from the draw's earlier states."""
         thetas, own = self.model.states.thetas(draw), list[MeshErrorEstimate]()
         for theta in thetas:
             own.append(self.error(theta, self._start(theta), known=[*known, *own]))
         fine = _flat(self.observe, [each.fine for each in own], thetas)
-        return Finer(fine, _flat(self.model.observe, [each.coarse for each in own], thetas), own)
+        return MeshPair(fine, _flat(self.model.observe, [each.coarse for each in own], thetas), own)
 
     @cached_property
     def _start(self) -> Callable[[jax.Array], jax.Array]:
@@ -128,14 +128,14 @@ class _Gripped:
     def workers(self) -> int:
         return self.gripped.workers
 
-    def __call__(self, draw: Mapping[str, Any], known: Known = ()) -> Finer:  # noqa: ARG002
+    def __call__(self, draw: Mapping[str, Any], known: Known = ()) -> MeshPair:  # noqa: ARG002
         """Return the data; what grips add is a share of the homogeneous stresses."""
         (theta,) = self.model.states.thetas(draw)
         solution = self.gripped.homogeneous.solve(theta).require_converged("the specimen")
         fields, thetas = [solution.displacement], theta[None]
         shares = self.gripped.shares(theta)
         fine = _flat(self.model.observe.gripped(shares), fields, thetas)
-        return Finer(fine, _flat(self.model.observe, fields, thetas))
+        return MeshPair(fine, _flat(self.model.observe, fields, thetas))
 
     def forget(self) -> None:
         """Do nothing: factors of a piece are small."""

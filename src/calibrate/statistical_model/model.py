@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any
 
 import jax
@@ -37,6 +37,7 @@ from calibrate.state_names import split
 from calibrate.statistical_model.load_states import LoadStates, boxed, load_states
 from calibrate.statistical_model.prior_range import check_known, fit_to, standardised
 from emulator.core.errors import InputError
+from emulator.core.kept import kept
 from emulator.scenes.parameter_space import Parameter
 from emulator.surrogates.protocol import ForwardMap, Prediction
 
@@ -354,7 +355,7 @@ class Model:
         return named
 
 
-@lru_cache(maxsize=4)
+@kept
 def _before_data(model: Model) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return draws (c, q) of the unknowns' prior, and predictions over it, by observation."""
     draws = jax.jit(lambda key: model.prior_draws(key, PRIOR_DRAWS))(jax.random.key(0))

@@ -15,14 +15,16 @@ One iteration is a pure function of the state, so that it can be compiled into a
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 
+from emulator.fem.assembly import System
 from emulator.fem.compiled import cond
 from emulator.fem.formulations import formulation_of
-from emulator.fem.newton import Direction, Newton, NewtonOptions, Step
+from emulator.fem.newton import NewtonOptions, Step, newton_step
 from emulator.fem.solution import LoadHistory, NewtonState, RoundOff, Status
 
 # Shortened steps after which a load level ends: elements that keep inverting show that the
@@ -38,8 +40,18 @@ _SMALLEST_CORRECTION = 1e-12  # correction that may be round-off, over the body'
 _STRETCH = 1e-6  # small enough for the forces to be linear in it
 
 
-class LoadStepping(Newton):
-    """Newton's method at one theta, from one load factor to the next."""
+@dataclass(frozen=True, eq=False)
+class LoadStepping:
+    """Newton's method at one theta, from one load factor to the next.
+
+    system : the equations.
+    options : the controls of the iteration.
+    theta : the parameters (p,).
+    """
+
+    system: System
+    options: NewtonOptions
+    theta: jax.Array
 
     def begin(self, start: jax.Array, round_off: RoundOff | None = None) -> NewtonState:
         r"""Return the first state: at ``start`` (n, 3) mm, or at rest if ``start`` is not valid.
@@ -77,27 +89,25 @@ class LoadStepping(Newton):
             lambda: (state.residual, state.relative_residual),
         )
         state = state._replace(residual=residual, relative_residual=relative)
-        direction = self.direction(state, allow_indefinite)
-        history = history._replace(monotone=history.monotone & direction.definite)
+        step = newton_step(self.system, self.options, self.theta, state, allow_indefinite)
+        history = history._replace(monotone=history.monotone & step.definite)
         state = state._replace(history=history)
-        return cond(direction.refused, lambda: state, lambda: self._after(state, direction))
+        return cond(step.refused, lambda: state, lambda: self._after(state, step))
 
-    def _after(self, state: NewtonState, direction: Direction) -> NewtonState:
+    def _after(self, state: NewtonState, step: Step) -> NewtonState:
         """Return the state after the part of a step that is taken."""
-        step = self.take_step(state, direction)
         state = state._replace(
-            tangent=direction.equations.tangent,
-            history=state.history._replace(singular=direction.singular),
+            tangent=step.tangent, history=state.history._replace(singular=step.singular)
         )
-        after = _next_state(state, step, direction.descends, direction.step, self.options)
+        after = _next_state(state, step._replace(couplings=None), self.options)
         if state.auxiliary is None:
             return after
         # The other unknowns follow the step, or begin anew at another load level.
-        formulation, couplings = formulation_of(self.system), direction.equations.couplings
-        full = jnp.where(step.fraction > 0.0, direction.step, 0.0)
+        formulation = formulation_of(self.system)
+        full = jnp.where(step.fraction > 0.0, step.full, 0.0)
         auxiliary = cond(
             after.load == state.load,
-            lambda: formulation.advance(state.auxiliary, couplings, full, step.fraction),
+            lambda: formulation.advance(state.auxiliary, step.couplings, full, step.fraction),
             lambda: formulation.begin(after.u, self.theta),
         )
         return after._replace(auxiliary=auxiliary)
@@ -151,26 +161,20 @@ def _first_state(
 
 
 @partial(jax.jit, static_argnames="options")
-def _next_state(
-    state: NewtonState, step: Step, descends: jax.Array, full: jax.Array, options: NewtonOptions
-) -> NewtonState:
-    """Stay at the load level, go on to a higher one, or fall back to a lower one.
-
-    descends : whether the tangent's own direction lowers the potential, as far as that is known.
-    full : the full step, (n, 3) mm.
-    """
+def _next_state(state: NewtonState, step: Step, options: NewtonOptions) -> NewtonState:
+    """Stay at the load level, go on to a higher one, or fall back to a lower one."""
     history, before, after = state.history, state.relative_residual, step.relative_residual
     finite, whole = jnp.isfinite(before) & jnp.isfinite(after), step.fraction == 1.0
     level_iterations, iterations = history.iterations + 1, state.iterations + 1
     quiet = before <= options.round_off  # round-off decides the sign of the step's slope
     # A step with a kept tangent that makes no progress is replaced, not cut short.
-    monotone = history.monotone & (descends | quiet) & (~state.renew | whole | quiet)
+    monotone = history.monotone & (step.descends | quiet) & (~state.renew | whole | quiet)
     inversions = history.inversions + (step.inverting & (step.fraction < 0.5))
     halved = 0.5 * (state.load - history.load)
 
     # Has the load level converged, or is it given up?
     round_off = finite & (jnp.linalg.norm(state.residual) <= state.round_off.residual)
-    round_off &= jnp.max(jnp.abs(full)) <= state.round_off.correction
+    round_off &= jnp.max(jnp.abs(step.full)) <= state.round_off.correction
     slow = state.renew & (after > _SLOW * before) & (level_iterations > 1)
     converged = (after <= options.tolerance) | (slow & (after <= options.round_off)) | round_off
     converged |= finite & (jnp.linalg.norm(step.residual) <= options.absolute)

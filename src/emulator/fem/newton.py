@@ -33,7 +33,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -111,39 +111,30 @@ class NewtonOptions:
         return cls(increment=1.0 / steps, max_iterations=max(cls.max_iterations, 20 * steps))
 
 
-class Direction(NamedTuple):
-    """Newton's full step.
-
-    step : the displacement increment, (n, 3) mm.
-    equations : the linear equations that it solves.
-    slope : the product residual . step in mN mm, before a reversal of the step.
-    on_supports : whether the prescribed displacements are met.
-    singular : whether the tangent is singular.
-    definite : whether its factorisation found it positive definite.
-    refused : whether there is no step, because the tangent had to be positive definite and is not.
-    descends : whether the tangent's own direction lowers the potential, as far as that is known.
-    """
-
-    step: jax.Array
-    equations: Linearised
-    slope: jax.Array
-    on_supports: jax.Array
-    singular: jax.Array
-    definite: jax.Array
-    refused: jax.Array
-    descends: jax.Array
-
-
 class Step(NamedTuple):
-    """The part of Newton's step that is taken.
+    """One iteration: Newton's full step, and the part of it that is taken.
 
-    u : the displacement after it, (n, 3) mm.
+    full : the displacement increment of the full step, (n, 3) mm.
+    tangent : the nonzeros (nnz,) of the tangent that it was solved with, mN/mm.
+    couplings : the data by which the formulation updates other unknowns, or None.
+    refused : whether there is no step, because the tangent had to be positive definite and is not.
+    definite : whether the factorisation found the tangent positive definite.
+    singular : whether the tangent is singular.
+    descends : whether the tangent's own direction lowers the potential, as far as that is known.
+    u : the displacement after the part that is taken, (n, 3) mm.
     residual : the residual there, (f,) mN.
     relative_residual : the norm of the residual relative to the forces.
-    fraction : the fraction of the full step; 0 where none makes progress.
+    fraction : the part taken, as a fraction of the full step; 0 where none makes progress.
     inverting : whether inverting elements forbade twice the fraction.
     """
 
+    full: jax.Array
+    tangent: jax.Array
+    couplings: Any
+    refused: jax.Array
+    definite: jax.Array
+    singular: jax.Array
+    descends: jax.Array
     u: jax.Array
     residual: jax.Array
     relative_residual: jax.Array
@@ -151,125 +142,117 @@ class Step(NamedTuple):
     inverting: jax.Array
 
 
-_TrialStep = tuple[Step, jax.Array, jax.Array]
-"""A trial step, whether the line search has been used, and whether the trials end."""
+_Part = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]
+"""The last five entries of :class:`Step`."""
+_TrialPart = tuple[_Part, jax.Array, jax.Array]
+"""A trial part of a step, whether the line search has been used, and whether the trials end."""
 _Descent = tuple[jax.Array, jax.Array, jax.Array]
 """A fraction of a step, its potential, and whether half of it may be lower."""
 
 
-@dataclass(frozen=True, eq=False)
-class Newton:
-    """One iteration of Newton's method at one theta.
+def newton_step(
+    system: System,
+    options: NewtonOptions,
+    theta: jax.Array,
+    state: NewtonState,
+    allow_indefinite: jax.Array | bool = True,
+) -> Step:
+    """Return one iteration of Newton's method at the load factor of ``state``.
 
-    system : the equations.
-    options : the controls of the iteration.
-    theta : the parameters (p,).
+    allow_indefinite : whether to step with a tangent that is not positive definite.
     """
+    u, load = state.u, state.load
+    equations = formulation_of(system).linearise(state, theta)  # residual and tangent
+    force = equations.residual + equations.offset_force
+    solution, outcome = system.attempt(equations.tangent, -force)
+    indefinite = outcome == Outcome.INDEFINITE
+    again = indefinite & allow_indefinite
+    solution = cond(again, lambda: system.solve(equations.tangent, -force), lambda: solution)
+    refused = indefinite & ~again
 
-    system: System
-    options: NewtonOptions
-    theta: jax.Array
+    on_supports, saddle = system.supports_met(u, theta, load), state.auxiliary is not None
+    bare, reversible = equations._replace(couplings=None), on_supports & (not saddle)
+    full, slope, singular = _full_step(system, u, theta, load, bare, reversible, solution)
+    descends = ~on_supports | (slope <= 0.0) | saddle
 
-    def direction(self, state: NewtonState, allow_indefinite: jax.Array | bool) -> Direction:
-        """Return the full step at ``state``, reversed where it would raise the potential."""
-        system, theta = self.system, self.theta
-        on_supports = system.supports_met(state.u, theta, state.load)
-        equations = formulation_of(system).linearise(state, theta)
-        force = equations.residual + equations.offset_force
-        full, outcome = system.attempt(equations.tangent, -force)
-        indefinite = outcome == Outcome.INDEFINITE
-        again = indefinite & allow_indefinite
-        full = cond(again, lambda: system.solve(equations.tangent, -force), lambda: full)
-        saddle = state.auxiliary is not None
-        bare, reversible = equations._replace(couplings=None), on_supports & (not saddle)
-        step, slope, singular = _full_step(
-            system, state.u, theta, state.load, bare, reversible, full
-        )
-        return Direction(
-            step,
-            equations,
-            slope,
-            on_supports,
-            singular,
-            definite=~indefinite,
-            refused=indefinite & ~again,
-            descends=~on_supports | (slope <= 0.0) | saddle,
-        )
+    none = (u, state.residual, state.relative_residual, jnp.zeros(()), jnp.array(False))
+    near = on_supports & (state.relative_residual < NEAR) & state.displacement_only
 
-    def take_step(self, state: NewtonState, direction: Direction) -> Step:
+    def search() -> tuple[jax.Array, jax.Array]:
+        return _line_search(system, options, theta, state, equations, full, slope, on_supports)
+
+    def attempt(trial: _TrialPart) -> _TrialPart:
         """Take the full step where the residual shows that it is good; otherwise search along it.
 
         A kept tangent is worth a full step or none: its direction is not searched along.
         """
-        system, theta, before = self.system, self.theta, state.relative_residual
-        none = Step(state.u, state.residual, before, jnp.zeros(()), jnp.array(False))
-        near = direction.on_supports & (before < NEAR) & state.displacement_only
+        searches = trial[1] | ~near
+        fraction, inverting = cond(searches, search, lambda: (jnp.ones(()), jnp.array(False)))
+        v = _advance(system, u, theta, full, fraction, load)
+        residual, relative = system.admissible_balance(v, theta, load)
+        J, J_before = system.least_volume_ratio(v), system.least_volume_ratio(u)
+        good = (relative <= 0.5 * state.relative_residual) & (options.shrink * J_before < J)
+        good |= searches
+        part = v, residual, relative, fraction, inverting
+        part = jax.tree.map(lambda yes, no: jnp.where(good, yes, no), part, none)
+        return part, jnp.array(True), good | ~state.renew
 
-        def attempt(trial: _TrialStep) -> _TrialStep:
-            _, searched, _ = trial
-            searches = searched | ~near
-            fraction, inverting = cond(
-                searches,
-                lambda: self._search(state, direction),
-                lambda: (jnp.ones(()), jnp.array(False)),
-            )
-            u = _advance(system, state.u, theta, direction.step, fraction, state.load)
-            residual, relative = system.admissible_balance(u, theta, state.load)
-            J, J_before = system.least_volume_ratio(u), system.least_volume_ratio(state.u)
-            good = searches | ((relative <= 0.5 * before) & (self.options.shrink * J_before < J))
-            step = Step(u, residual, relative, fraction, inverting)
-            step = jax.tree.map(lambda yes, no: jnp.where(good, yes, no), step, none)
-            return step, jnp.array(True), good | ~state.renew
+    first = none, jnp.array(False), refused | (~near & ~state.renew)
+    part = while_loop(lambda trial: ~trial[2], attempt, first)[0]
+    tangent, couplings = equations.tangent, equations.couplings
+    return Step(full, tangent, couplings, refused, ~indefinite, singular, descends, *part)
 
-        first = none, jnp.array(False), ~near & ~state.renew
-        return while_loop(lambda trial: ~trial[2], attempt, first)[0]
 
-    def _search(self, state: NewtonState, direction: Direction) -> tuple[jax.Array, jax.Array]:
-        """Return the fraction of the step to take, and whether inverting elements forbade twice it.
+def _line_search(
+    system: System,
+    options: NewtonOptions,
+    theta: jax.Array,
+    state: NewtonState,
+    equations: Linearised,
+    step: jax.Array,
+    slope: jax.Array,
+    on_supports: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """Return the fraction of ``step`` to take, and whether inverting elements forbade twice it.
 
-        The fraction is 0 where none makes progress.
-        """
-        system, theta, u, step = self.system, self.theta, state.u, direction.step
-        equations, on_supports = direction.equations, direction.on_supports
-        test = formulation_of(system).monotonicity_test(state, theta, equations, step)
-        admissible = system.keeps_volume(u, step, self.options.shrink)
-        if test is not None:
-            # Round-off cannot be distinguished from progress, so it passes the test.
-            unclear = state.relative_residual <= self.options.round_off
-            trial = backtrack(
-                admissible, lambda f: (unclear | test(f), jnp.zeros(())), _LEAST_MONOTONE
-            )
-            return jnp.where(trial.accepted, trial.fraction, 0.0), trial.inverting
-        follower = system.follower_force(u, theta)
+    The fraction is 0 where none makes progress.
+    """
+    u, load = state.u, state.load
+    admissible = system.keeps_volume(u, step, options.shrink)
+    test = formulation_of(system).monotonicity_test(state, theta, equations, step)
+    if test is not None:
+        # Round-off cannot be distinguished from progress, so it passes the test.
+        unclear = state.relative_residual <= options.round_off
+        trial = backtrack(admissible, lambda f: (unclear | test(f), jnp.zeros(())), _LEAST_MONOTONE)
+        return jnp.where(trial.accepted, trial.fraction, 0.0), trial.inverting
+    follower = system.follower_force(u, theta)
 
-        def potential(fraction: jax.Array) -> tuple[jax.Array, jax.Array]:
-            return system.potential(u + fraction * step, theta, state.load, follower)
+    def potential(fraction: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return system.potential(u + fraction * step, theta, load, follower)
 
-        falls = armijo(
-            potential, jnp.where(on_supports, -ARMIJO * jnp.abs(direction.slope), jnp.inf)
-        )
+    falls = armijo(potential, jnp.where(on_supports, -ARMIJO * jnp.abs(slope), jnp.inf))
 
-        def progress(fraction: jax.Array) -> tuple[jax.Array, jax.Array]:
-            """Return Armijo's rule, or a smaller residual where loads have no potential."""
-            lower, energy = falls(fraction)
-            if system.forces:
-                residual = system.balance(u + fraction * step, theta, state.load).residual
-                squared_norm = jnp.sum(equations.residual**2)
-                lower |= jnp.sum(residual**2) < (1.0 - ARMIJO * fraction) * squared_norm
-            return lower, energy
+    def progress(fraction: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return Armijo's rule, or a smaller residual where loads have no potential."""
+        lower, energy = falls(fraction)
+        if system.forces:
+            residual = system.balance(u + fraction * step, theta, load).residual
+            squared_norm = jnp.sum(equations.residual**2)
+            lower |= jnp.sum(residual**2) < (1.0 - ARMIJO * fraction) * squared_norm
+        return lower, energy
 
-        trial = backtrack(admissible, progress, _LEAST_FRACTION)
+    trial = backtrack(admissible, progress, _LEAST_FRACTION)
 
-        def halve(at: _Descent) -> _Descent:
-            fraction, least, _ = at
-            energy = potential(0.5 * fraction)[0]
-            lower = energy < least
-            fraction = jnp.where(lower, 0.5 * fraction, fraction)
-            return fraction, jnp.where(lower, energy, least), lower
+    def halve(at: _Descent) -> _Descent:
+        fraction, least, _ = at
+        energy = potential(0.5 * fraction)[0]
+        lower = energy < least
+        fraction = jnp.where(lower, 0.5 * fraction, fraction)
+        return fraction, jnp.where(lower, energy, least), lower
 
-        first = trial.fraction, trial.energy, on_supports & trial.accepted
-        fraction = while_loop(lambda at: at[2] & (at[0] > _SMALLEST_HALVED), halve, first)[0]
-        return jnp.where(trial.accepted, fraction, 0.0), trial.inverting
+    first = trial.fraction, trial.energy, on_supports & trial.accepted
+    fraction = while_loop(lambda at: at[2] & (at[0] > _SMALLEST_HALVED), halve, first)[0]
+    return jnp.where(trial.accepted, fraction, 0.0), trial.inverting
 
 
 @compiled

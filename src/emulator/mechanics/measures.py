@@ -13,12 +13,12 @@ or close to one. The solver uses the separation (:mod:`emulator.fem.stress_itera
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import lru_cache
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.core.kept import kept
 from emulator.mechanics.kinematics import Strain, cofactor
 from emulator.mechanics.laws.law import Law
 
@@ -89,7 +89,7 @@ class _Notes(dict[str, jax.Array]):
         return self.setdefault(name, jnp.zeros(_SHAPES[name]))
 
 
-@lru_cache(maxsize=64)
+@kept
 def measures_read(law: Law) -> tuple[str, ...] | None:
     """Return the names of the measures that ``law`` reads; ``None`` if it reads anything else.
 

@@ -26,11 +26,11 @@ from emulator.core.store import inside
 from emulator.scenes.finer import Finer
 from emulator.scenes.scene import Scene
 from emulator.surrogates.discrepancy import Discrepancy
-from emulator.surrogates.part import CachedPart, Part, arrays_of, together, widened
+from emulator.surrogates.part import CachedPart, EmulatorPart, arrays_of, together, widened
 from emulator.surrogates.polynomial import Polynomial
 from emulator.surrogates.taylor import Expansion
 
-_PARTS: dict[str, type[Part]] = {
+_PARTS: dict[str, type[EmulatorPart]] = {
     "taylor": Expansion,
     "polynomial": Polynomial,
     "discrepancy": Discrepancy,
@@ -45,7 +45,7 @@ class Coarse:
     prolongation : the matrix P, (fine nodes, coarse nodes).
     """
 
-    parts: Mapping[str, Part]
+    parts: Mapping[str, EmulatorPart]
     prolongation: csr_matrix
 
     def __call__(self, position: jax.Array) -> jax.Array:
@@ -90,7 +90,7 @@ class Coarse:
         return cls(parts, rows)
 
 
-def carried(parts: Mapping[str, Part], body: Finer) -> Coarse:
+def carried(parts: Mapping[str, EmulatorPart], body: Finer) -> Coarse:
     """Return the ``parts`` of an emulator of ``body.coarse`` on the finer mesh.
 
     :class:`InputError` for no parts, or one that is no series, polynomial or discrepancy.

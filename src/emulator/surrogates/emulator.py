@@ -10,7 +10,7 @@ r"""The emulator of a scene, a sum of parts of which any may be absent, and its 
     \quad\text{where free}
 
 with :math:`x` the position of theta in its unit box. The sum knows its parts only as
-:class:`~emulator.surrogates.part.Part`.
+:class:`~emulator.surrogates.part.EmulatorPart`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -31,14 +31,14 @@ from scipy.sparse import csr_array
 from emulator.catalogue import scene_from_origin
 from emulator.core.display import TableRepr
 from emulator.core.errors import InputError, look_up
+from emulator.core.rooms import offered
 from emulator.core.store import inside, read_arrays, read_json, save_arrays, write_json
 from emulator.fem.reactions import SupportForce
 from emulator.scenes.scene import Scene, all_nodes, check_nodes
 from emulator.surrogates.coarse import Coarse
 from emulator.surrogates.discrepancy import Discrepancy
 from emulator.surrogates.network import Network
-from emulator.surrogates.network.family import FamilyNetwork
-from emulator.surrogates.part import CachedPart, Part, arrays_of, together
+from emulator.surrogates.part import CachedPart, EmulatorPart, arrays_of, together
 from emulator.surrogates.polynomial import Polynomial
 from emulator.surrogates.protocol import (
     ForwardKind,
@@ -53,16 +53,23 @@ from emulator.surrogates.protocol import (
 from emulator.surrogates.support_work import SupportWork, amount_of
 from emulator.surrogates.taylor import Expansion
 
+if TYPE_CHECKING:
+    from emulator.surrogates.network.family import FamilyNetwork
+
 FORMAT = 3
 """The format of files: ``emulator.json`` describes, ``weights.safetensors`` has the arrays."""
 SHIPPED = Path(__file__).parent.parent / "shipped"
 
-PARTS: dict[str, type[Part]] = {
+PARTS: dict[str, type[EmulatorPart]] = {
     "coarse": Coarse,
     "taylor": Expansion,
     "polynomial": Polynomial,
     "network": Network,
-    "family": FamilyNetwork,
+    **dict(
+        zip(
+            ["family"], offered("emulator.surrogates.network.family", "FamilyNetwork"), strict=False
+        )
+    ),
     "discrepancy": Discrepancy,
 }
 """The kinds of parts in the order of the sum, by the field of :class:`Emulator`."""
@@ -103,7 +110,7 @@ class Emulator(TableRepr):
         return f"Emulator of '{self.scene.name}'", [*about, rows[0], rows[-1]]
 
     @property
-    def parts(self) -> dict[str, Part]:
+    def parts(self) -> dict[str, EmulatorPart]:
         """The parts that are present, in the order they are summed."""
         named = {name: getattr(self, name) for name in PARTS}
         return {name: part for name, part in named.items() if part is not None}

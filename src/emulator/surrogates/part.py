@@ -21,7 +21,7 @@ from emulator.core.store import inside, named_leaves
 from emulator.scenes.scene import Scene
 
 
-class Part(Protocol):
+class EmulatorPart(Protocol):
     """One term of an emulator's sum."""
 
     def __call__(self, position: jax.Array) -> jax.Array:
@@ -48,7 +48,7 @@ class Part(Protocol):
         ...
 
 
-def arrays_of(parts: Mapping[str, Part]) -> dict[str, Any]:
+def arrays_of(parts: Mapping[str, EmulatorPart]) -> dict[str, Any]:
     """Return the arrays of parts by name, such as ``taylor/derivatives``."""
     return {f"{n}/{k}": array for n, part in parts.items() for k, array in part.arrays().items()}
 

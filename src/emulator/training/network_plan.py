@@ -23,7 +23,7 @@ from emulator.training.plan import Job, Plan
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class PreparedTraining:
     """The training of a network once its FEM runs are there.
 
     plan : the plan, with as many simulations as were run.
@@ -66,7 +66,7 @@ class NetworkPlan(Plan):
         """The share of a budget after which the last step ends."""
         return 0.99
 
-    def prepare(self, job: Job) -> Problem:
+    def prepare(self, job: Job) -> PreparedTraining:
         """Return the FEM runs, and an emulator whose network is untrained."""
         raise NotImplementedError
 

@@ -23,7 +23,7 @@ from emulator.fem.campaign.designs import uniform
 from emulator.fem.energy import potential_energy
 from emulator.mechanics.kinematics import Barriers
 from emulator.surrogates.network.pignn import Architecture
-from emulator.training.network_plan import NetworkPlan, Problem, untrained
+from emulator.training.network_plan import NetworkPlan, PreparedTraining, untrained
 from emulator.training.optimiser import NetworkTraining, Weights, clipped_adam, halves
 from emulator.training.plan import Job
 
@@ -44,7 +44,7 @@ class Paper(NetworkPlan):
         super().__post_init__()
         self.require_at_least(1, "batch")
 
-    def prepare(self, job: Job) -> Problem:
+    def prepare(self, job: Job) -> PreparedTraining:
         """Return the FEM solution at the centre, and an emulator whose network is untrained."""
         scene = job.scene
         architecture = replace(job.architecture or Architecture(), decoder="pointwise")
@@ -69,4 +69,4 @@ class Paper(NetworkPlan):
             return *jax.value_and_grad(loss)(weights), weights
 
         training = NetworkTraining(network, clipped_adam(), halves(self.learning_rate), descend)
-        return Problem(self, emulator, runs, training)
+        return PreparedTraining(self, emulator, runs, training)

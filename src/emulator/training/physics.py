@@ -23,7 +23,7 @@ from emulator.surrogates.taylor import constant
 from emulator.training.checkpoint import Record, Session
 from emulator.training.mechanics import FEM_SHARE
 from emulator.training.mode_fit import ModeFit, scales_of
-from emulator.training.network_plan import NetworkPlan, Problem, untrained
+from emulator.training.network_plan import NetworkPlan, PreparedTraining, untrained
 from emulator.training.optimiser import NetworkTraining, cosine, orthogonal_steps
 from emulator.training.plan import Job, check_runs
 from emulator.training.sweeps import check_sweeps, runs_of, sweep_box
@@ -42,7 +42,7 @@ solve, and a deep branch (docs/experiments.md, "A network alone")."""
 
 
 @dataclass(frozen=True)
-class Physics(NetworkPlan):
+class PhysicsPlan(NetworkPlan):
     """A separable network that is fitted to values and slopes of equilibria.
 
     sweeps : the largest number of sweeps over the box; 0 for FEM runs instead.
@@ -80,7 +80,7 @@ class Physics(NetworkPlan):
                 session.write_plan(self)
         return super().train(job, session)
 
-    def prepare(self, job: Job) -> Problem:
+    def prepare(self, job: Job) -> PreparedTraining:
         """Return the equilibria to learn from, and an emulator whose network is untrained."""
         if self.sweeps:
             plan, runs, record = self._swept(job)
@@ -103,7 +103,7 @@ class Physics(NetworkPlan):
             fit.descend,
             partial(fit.finish, plan.polish, job.deadline(0.99)),
         )
-        return Problem(plan, emulator, runs, training, record)
+        return PreparedTraining(plan, emulator, runs, training, record)
 
     def _swept(self, job: Job) -> tuple[Self, Runs, Record]:
         """Return the plan with the sweeps made, their polynomial at ``simulations`` theta."""

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from emulator.core.errors import InputError, look_up
+from emulator.core.rooms import offered
 from emulator.core.schema import read_as
 from emulator.fem.campaign import StoredRuns
 from emulator.scenes.scene import Scene
@@ -21,20 +22,17 @@ from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.network.pignn import Architecture
 from emulator.training.checkpoint import CHECKPOINT, SWEEPS, Session
 from emulator.training.mechanics import Mechanics
-from emulator.training.paper import Paper
-from emulator.training.physics import Physics
 from emulator.training.plan import Job, Plan
-from emulator.training.sweeps import Sweeps
 from emulator.training.two_meshes import TwoMeshes
 
-_ALL: tuple[Plan, ...] = (
-    Mechanics(),
-    TwoMeshes(),
-    Physics(),
-    Sweeps(),
-    Paper(),
+_ALL: tuple[type[Plan], ...] = (
+    Mechanics,
+    TwoMeshes,
+    *offered("emulator.training.physics", "PhysicsPlan"),
+    *offered("emulator.training.sweeps", "Sweeps"),
+    *offered("emulator.training.paper", "Paper"),
 )
-RECIPES: dict[str, Plan] = {plan.recipe: plan for plan in _ALL}
+RECIPES: dict[str, Plan] = {kind.recipe: kind() for kind in _ALL}
 
 
 def recipe(name: str) -> Any:  # a Plan; each has options of its own, which ``replace`` takes

@@ -6,7 +6,7 @@ import pytest
 
 import calibrate as cal
 from calibrate.analysis import effects
-from calibrate.analysis.effects import Comparison, recommend, tolerances
+from calibrate.analysis.effects import WithoutTerms, recommend, tolerances
 from calibrate.cli import main
 from calibrate.measurements import observations, spread_landmarks
 from emulator.core.errors import InputError, SolverError
@@ -46,7 +46,7 @@ def loose(pulled, corners):
 def test_changes_are_those_of_fem(pulled, corners, loose):
     alone = {each.left_out: each for each in loose.alone}
     assert set(alone) == {("finite strain",), ("gravity",)}
-    comparison = Comparison(pulled, observations(corners), 2, 0)
+    comparison = WithoutTerms(pulled, observations(corners), 2, 0)
     scene = pulled
     thetas = sobol(scene, 2, 0)
     with_it, without = Simulator(scene), Simulator(leave_out(scene, ["gravity"]))
@@ -76,15 +76,15 @@ def test_an_effect_that_matters_stays(pulled, corners):
 
 
 def test_a_choice_that_does_not_hold_elsewhere_is_taken_back(pulled, corners, monkeypatch):
-    first = Comparison(pulled, observations(corners), 2, 0)
-    lying = Comparison.without
+    first = WithoutTerms(pulled, observations(corners), 2, 0)
+    lying = WithoutTerms.without
 
     def without(self, names):
         found = lying(self, names)
         chosen_at = np.array_equal(self._thetas, first._thetas)
         return replace(found, changes={"displacement": 0.0}) if chosen_at else found
 
-    monkeypatch.setattr(Comparison, "without", without)
+    monkeypatch.setattr(WithoutTerms, "without", without)
     found = recommend(pulled, corners, 1e-2, samples=2)
     assert "finite strain" not in found.left_out
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import calibrate as cal
-from calibrate.certificate.runs import Solver, descend
+from calibrate.certificate.runs import FEMRunner, descend
 from calibrate.statistical_model import FEMLikelihood
 from calibrate.statistical_model.predictive import Predictive
 from certificate_support import grid_of, linear_model, posterior_of
@@ -55,7 +55,7 @@ def test_descents_end_at_the_mode_that_the_map_hides(fem, posterior):
     z = predictive.unconstrain(posterior.draws())
     with counting(total=1, desc="", disable=True, unit="run") as bar:
         likelihood = FEMLikelihood(posterior.model, LinearSimulator(fem))
-        solver = Solver(predictive, likelihood, bar)
+        solver = FEMRunner(predictive, likelihood, bar)
         starts = z[:1] + np.array([[0.0, 2.2], [1.0, 1.9], [-0.5, 3.0]])  # lam, mu
         runs, modes = descend(solver, solver(starts, slopes=True), solver(z[:1]), z, 12, rng)
     assert len(runs.z) <= 12
@@ -71,7 +71,7 @@ def test_gradient_and_curvature_are_those_of_differences(fem, posterior):
     z = predictive.unconstrain({"mu": np.array([83.0]), "lam": np.array([71.0])})[0]
     with counting(total=1, desc="", disable=True, unit="run") as bar:
         likelihood = FEMLikelihood(posterior.model, LinearSimulator(fem))
-        solver = Solver(predictive, likelihood, bar)
+        solver = FEMRunner(predictive, likelihood, bar)
         here = solver(z[None], slopes=True)
         np.testing.assert_array_equal(solver(z[None]).fem, here.fem)  # known: nothing to solve
         ahead, behind = (solver(z + sign * 1e-4 * np.eye(2)) for sign in (1.0, -1.0))

@@ -24,7 +24,7 @@ def test_solved_data_are_the_traced_program_s(beam, simulator, states):
     model = cal.model(forward, observe, {"end": cal.GaussianNoise(sd=0.2)})
     key = jax.random.key(0)
     found = prior_replicates(model, key, 5)
-    draws, data, valid = _over_draws(_prior, model)((jax.random.split(key, 5),))
+    draws, data, valid = _over_draws(model, _prior)((jax.random.split(key, 5),))
     assert np.asarray(valid).all()
     for name, values in found.draws.items():
         np.testing.assert_array_equal(values, draws[name])

@@ -60,7 +60,7 @@ def test_few_frames_lie_between_a_command_and_its_data_and_its_likelihood():
     """An experiment's data was parsed four times, by 10 frames. To the likelihood five frames are the
     sampler's, four the program's that evaluates it in blocks.
     """
-    parse, likelihood = journeys.parse(), journeys.likelihood()
+    parse, likelihood = journeys.parse().frames, journeys.likelihood().frames
     assert len(parse) <= 6
     assert len(likelihood) <= 18
     assert len(dict.fromkeys([*parse, *likelihood])) <= 21
@@ -86,19 +86,13 @@ def test_a_mistake_is_reported_before_the_forward_map_is_built(count, monkeypatc
         infer(run)
 
 
-def test_simulators_are_found_by_the_fingerprint_of_their_scene():
-    first, again = (em.scenes.once_clamped_beam(cells=(4, 1, 1), order=1) for _ in range(2))
-    other = em.scenes.once_clamped_beam(cells=(4, 1, 1), order=2)
-    assert first is not again
+def test_a_scene_keeps_its_simulator_and_never_gets_that_of_an_equal_scene():
+    first, equal = (em.scenes.once_clamped_beam(cells=(4, 1, 1), order=1) for _ in range(2))
     simulator = simulator_of(first, 1)
-    assert simulator_of(again, 1) is simulator
-    assert simulator_of(first, 2) is not simulator
     assert simulator_of(first, 1) is simulator
-    simulator_of(other, 1)
-    assert simulator_of(first, 1) is simulator  # the one used longest ago went
-    simulator_of(other, 2)
-    simulator_of(other, 1)
-    assert simulator_of(first, 1) is not simulator
+    assert simulator.scene is first
+    assert simulator_of(first, 2) is not simulator
+    assert simulator_of(equal, 1).scene is equal
 
 
 def test_fem_data_of_a_check_is_solved_in_the_load_steps_of_the_run(count, monkeypatch, tmp_path):

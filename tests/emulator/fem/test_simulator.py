@@ -15,7 +15,7 @@ from scene_support import block, slope
 
 
 def test_the_law_is_eleven_frames_from_the_call():
-    frames = journeys.solve()
+    frames = journeys.solve().frames
     assert frames[0].function == "Simulator.solve"
     assert frames[-1].file.startswith("emulator/mechanics/laws/")
     assert len(frames) <= 11

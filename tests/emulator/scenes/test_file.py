@@ -28,7 +28,7 @@ from scene_file_support import HEART, SCENE
 
 
 def test_few_frames_lie_between_a_command_and_its_scene():
-    frames = journeys.scene_file()
+    frames = journeys.scene_file().frames
     assert len(frames) <= 6
     assert frames[-1].function == "SceneData.__post_init__"
 

@@ -16,13 +16,13 @@ from emulator.surrogates.network.pignn import Architecture
 from emulator.training import train
 from emulator.training.mode_fit import ModeFit, mean_square_gradient, scales_of
 from emulator.training.optimiser import orthogonal_steps
-from emulator.training.physics import Physics
+from emulator.training.physics import PhysicsPlan
 from emulator.training.plan import Job
 
 SMALL = Architecture(
     steps=2, latent=8, hidden=(16, 16), decoder="separable", modes=6, trunk=(16, 40)
 )
-PLAN = Physics(sweeps=0, simulations=12, steps=30, polish=100)
+PLAN = PhysicsPlan(sweeps=0, simulations=12, steps=30, polish=100)
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from emulator.training.checkpoint import CHECKPOINT, Session, State
 from emulator.training.mechanics import Mechanics
 from emulator.training.optimiser import WARMUP, cosine
 from emulator.training.paper import Paper
-from emulator.training.physics import Physics
+from emulator.training.physics import PhysicsPlan
 from emulator.training.plan import Job
 
 SMALL = Architecture(steps=2, latent=8, hidden=(16, 16))
@@ -116,7 +116,7 @@ def test_a_budget_too_small_says_how_much_more(beam, tmp_path):
 )
 def test_plans_that_cannot_work(options, message):
     with pytest.raises(InputError, match=message):
-        Physics(**options)
+        PhysicsPlan(**options)
 
 
 def test_learning_rate_rises_then_falls():
@@ -220,12 +220,12 @@ def test_an_aim_follows_the_clock(monkeypatch):
 def test_a_campaign_s_runs_are_asked_for_again(beam, tests, tmp_path):
     """Resumed on other FEM runs, a training would not be the one that was begun."""
     stored = StoredRuns(tests, "0123456789abcdef")
-    plan = Physics(sweeps=0, simulations=6, steps=30, polish=0, checkpoint_every=10)
+    plan = PhysicsPlan(sweeps=0, simulations=6, steps=30, polish=0, checkpoint_every=10)
     whole = train(beam, plan, tmp_path, architecture=SEPARABLE, campaign=stored)
     assert whole.record["plan"]["campaign"] == stored.digest
     with pytest.raises(InputError, match="trained on FEM runs of a campaign; resume it with"):
-        train(beam, Physics(), tmp_path, resume=True)
-    resumed = train(beam, Physics(), tmp_path, resume=True, campaign=stored)
+        train(beam, PhysicsPlan(), tmp_path, resume=True)
+    resumed = train(beam, PhysicsPlan(), tmp_path, resume=True, campaign=stored)
     leaves = [jax.tree.leaves(e.network.weights) for e in (whole, resumed)]
     for a, b in zip(*leaves, strict=True):
         np.testing.assert_array_equal(a, b)

@@ -31,13 +31,14 @@ if TYPE_CHECKING:
 def infer(arguments: Namespace) -> Answer:
     """Sample and certify a posterior, or those of members of a population, and save them."""
     from calibrate.cli.run_words import plan_of
-    from calibrate.project import certify_and_keep, infer, read_problem, report
-    from calibrate.project.members import Members, infer_members, members_report
+    from calibrate.project import Problem, Run, certify_and_keep, infer, read_problem, report
 
     folder, progress = check_folder(arguments.out), not arguments.json
     plan, force, certify = plan_of(arguments), arguments.force, not arguments.no_certify
     written = f"written to {arguments.out}; its page: calibrate report {arguments.out}"
-    if isinstance(plan, Members):
+    if not isinstance(plan, Run | Problem):
+        from calibrate.project.members import infer_members, members_report  # a room
+
         hierarchy, verdicts = infer_members(
             plan, folder, certify=certify, force=force, progress=progress
         )
@@ -206,7 +207,8 @@ def demo(arguments: Namespace) -> Answer:
         write_report(arguments.out)
     result["seconds"] = round(time.perf_counter() - start, 1)
     names = ("posterior.nc", "certificate.json", PICTURE if is_beam else REPORT)
-    result["files"] = [f"{arguments.out}/{name}" for name in names]
+    paths = [f"{arguments.out}/{name}" for name in names]
+    result["files"] = [path for path in paths if Path(path).exists()]
     lines = [posterior_summary(result)]
     if "identifiability" in result:
         from calibrate.analysis.identifiability import in_words

@@ -25,12 +25,12 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.core.kept import kept
 from emulator.mechanics.kinematics import Strain
 
 
@@ -144,7 +144,7 @@ _DIGITS = 8
 _LARGEST = 0.25  # bound of a probe's displacement gradient, entry by entry
 
 
-@lru_cache(maxsize=64)
+@kept
 def law_identity(law: Law) -> str:
     """Return the name of the law and a hash of its parameters and of its energy at the probes."""
     parameters = [[q.name, q.unit, q.low, q.high] for q in law.quantities]

@@ -65,7 +65,7 @@ def augment(scene: Scene) -> AugmentedGraph:
 
 
 @dataclass(frozen=True, eq=False)
-class Hierarchy:
+class Coarsenings:
     """Mesh nodes and the virtual layers above them.
 
     pairs : the joined nodes (E, 2), receiver < sender, each pair once.
@@ -83,7 +83,7 @@ class Hierarchy:
         return np.concatenate(each)
 
 
-def hierarchy(positions: np.ndarray, edges: np.ndarray) -> Hierarchy:
+def hierarchy(positions: np.ndarray, edges: np.ndarray) -> Coarsenings:
     """Return virtual layers above the nodes at ``positions`` (n, 3), joined by ``edges`` (e, 2)."""
     layer_edges, parents, offset = [edges], [], 0
     while (count := len(positions) // CLUSTER) >= _SMALLEST:
@@ -98,7 +98,7 @@ def hierarchy(positions: np.ndarray, edges: np.ndarray) -> Hierarchy:
             layer_edges.append(above + neighbours(positions, NEIGHBOURS))
         offset = above
     pairs = np.unique(np.sort(np.concatenate(layer_edges), axis=1), axis=0)
-    return Hierarchy(pairs, tuple(parents))
+    return Coarsenings(pairs, tuple(parents))
 
 
 def clusters(positions: np.ndarray, count: int, weights: np.ndarray | None = None) -> np.ndarray:

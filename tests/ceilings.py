@@ -1,0 +1,194 @@
+"""How much of what grows unseen there is in the source: mechanisms, names, long functions.
+
+``python -m tests.ceilings`` prints each figure beside its ceiling. A ceiling is lowered by the
+change that lowers its figure, and never raised: a new capability uses the mechanism that is there.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator
+from functools import cache, partial
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+WORDS = {"own": 89, "found": 51, "given": 24, "told": 12, "moved": 15, "each": 196}
+"""Words that name nothing, each with the number of names that are called so at most."""
+
+LONGEST = 60  # lines of a function, with its docstring
+_SOLVES = {"solve", "inv", "lstsq", "cholesky", "cho_solve", "cho_factor", "solve_triangular"}
+_FACTORS = {"mmHg", "kPa", "Pa", "mm", "cm", "m", "mL", "mm3", "mN", "N", "um", "µm"}
+
+
+@cache
+def sources() -> dict[str, ast.Module]:
+    """Return the syntax tree of each file of the source, by its path in ``src``."""
+    files = sorted((ROOT / "src").rglob("*.py"))
+    return {
+        str(path.relative_to(ROOT / "src")): ast.parse(path.read_text(encoding="utf-8"))
+        for path in files
+    }
+
+
+def nodes[N: ast.AST](kind: type[N]) -> Iterator[tuple[str, N]]:
+    """Yield every node of ``kind`` in the source, with its file."""
+    for file, tree in sources().items():
+        for node in ast.walk(tree):
+            if isinstance(node, kind):
+                yield file, node
+
+
+def ambiguous_classes() -> list[str]:
+    """Return the class names that are used in more than one file."""
+    files = defaultdict(set)
+    for file, node in nodes(ast.ClassDef):
+        files[node.name].add(file)
+    return sorted(name for name, where in files.items() if len(where) > 1)
+
+
+def long_functions() -> list[str]:
+    """Return the functions of more than :data:`LONGEST` lines."""
+    return [
+        f"{file}:{node.name} {node.end_lineno - node.lineno + 1}"
+        for file, node in nodes(ast.FunctionDef)
+        if (node.end_lineno or 0) - node.lineno + 1 > LONGEST
+    ]
+
+
+def tables_of_units() -> list[str]:
+    """Return the files that have factors between units, by a dictionary of units and numbers."""
+    files = set()
+    for file, node in nodes(ast.Dict):
+        keys = {key.value for key in node.keys if isinstance(key, ast.Constant)}
+        numbers = [value for value in node.values if isinstance(value, ast.Constant | ast.BinOp)]
+        numeric = [v for v in numbers if not isinstance(getattr(v, "value", 0.0), str)]
+        if keys & _FACTORS and numeric:
+            files.add(file)
+    return sorted(files)
+
+
+def process_wide_objects() -> list[str]:
+    """Return what one process has one of: changing containers and locks of a module, and caches.
+
+    A cache counts where it is called with objects: they are found again by identity or equality,
+    and outlive what they follow from. ``emulator.core.kept`` keeps results with their owner.
+    """
+    made = re.compile(r"(\w*Lock|dict|list|set|defaultdict|Weak\w+)(\[.*\])?\(\)|\{\}|\[.*\]")
+    objects = []
+    for file, tree in sources().items():
+        for node in tree.body:
+            if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+                target = node.targets[0] if isinstance(node, ast.Assign) else node.target
+                name = ast.unparse(target)
+                changes = not name.strip("_").isupper() or ast.unparse(node.value) in ("{}", "[]")
+                if changes and name != "__all__" and made.fullmatch(ast.unparse(node.value)):
+                    objects.append(f"{file}:{name}")
+    for file, node in nodes(ast.FunctionDef):
+        cached = [d for d in node.decorator_list if re.match(r"(lru_)?cache\b", ast.unparse(d))]
+        simple = {"int", "float", "str", "bool", "tuple[int, ...]", "tuple[str, ...]"}
+        types = {ast.unparse(a.annotation) for a in node.args.args if a.annotation}
+        if cached and types - simple:
+            objects.append(f"{file}:{node.name}")
+    return objects
+
+
+def modules_that_call(names: set[str], outside: tuple[str, ...] = ()) -> list[str]:
+    """Return the files that call a function of one of ``names``, but those that begin with ..."""
+    files = set()
+    for file, node in nodes(ast.Call):
+        function = node.func
+        name = function.attr if isinstance(function, ast.Attribute) else ast.unparse(function)
+        library = not isinstance(function, ast.Attribute) or "linalg" in ast.unparse(function)
+        if name in names and library and not file.startswith(outside):
+            files.add(file)
+    return sorted(files)
+
+
+def dense_solves() -> list[str]:
+    """Return the files that solve dense systems: regressions, Newton steps, small matrices."""
+    return modules_that_call(_SOLVES, ("emulator/fem/", "emulator/core/"))
+
+
+def weighted_points() -> list[str]:
+    """Return the files that weight points by densities of their own, besides the one engine."""
+    return modules_that_call({"logsumexp"}, ("calibrate/importance/",))
+
+
+def observation_members() -> list[str]:
+    """Return the methods and attributes of the base class of observations."""
+    from calibrate.measurements.observation import Observation
+
+    return [name for name in vars(Observation) if not name.startswith("__") and name != "_abc_impl"]
+
+
+def public_names() -> list[str]:
+    """Return the names that ``import calibrate`` and ``import emulator`` offer."""
+    import calibrate
+    import emulator
+
+    return sorted({*calibrate.__all__, *emulator.__all__})
+
+
+def deep_imports_of_studies() -> list[str]:
+    """Return the lines of studies that import from within the packages."""
+    deep = re.compile(r"^\s*(from|import) (calibrate|emulator)\.\w.*$", re.MULTILINE)
+    files = sorted((ROOT / "studies").rglob("*.py"))
+    return [m[0].strip() for path in files for m in deep.finditer(path.read_text("utf-8"))]
+
+
+def names_called(word: str) -> list[str]:
+    """Return the files in which ``word`` names a variable, argument, attribute or function."""
+    kinds = (ast.Name, ast.arg, ast.FunctionDef, ast.ClassDef)
+    return [file for kind in kinds for file, node in nodes(kind) if _name(node).strip("_") == word]
+
+
+def _name(node: ast.AST) -> str:
+    if isinstance(node, ast.Name):
+        return node.id if isinstance(node.ctx, ast.Store) else ""
+    return node.arg if isinstance(node, ast.arg) else str(getattr(node, "name", ""))
+
+
+def spine() -> list[str]:
+    """Return the files from a law to a verdict, as ARCHITECTURE.md has them, in its order."""
+    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    chapter = text[text.index("## The spine") : text.index("## Floors")]
+    return re.findall(r"`((?:emulator|calibrate)/[^`]+\.py)`", chapter)
+
+
+def lines_of_spine() -> list[str]:
+    """Return the lines of the spine's files."""
+    files = [ROOT / "src" / file for file in spine()]
+    return [line for file in files for line in file.read_text(encoding="utf-8").splitlines()]
+
+
+FIGURES: dict[str, tuple[int, Callable[[], list[str]]]] = {
+    "class names with two meanings": (11, ambiguous_classes),
+    "files with a table of units": (6, tables_of_units),
+    "objects and caches of the process": (3, process_wide_objects),
+    "files that weight points": (6, weighted_points),
+    "files that solve dense systems": (22, dense_solves),
+    "members of Observation": (33, observation_members),
+    "public names": (144, public_names),
+    "deep imports of studies": (566, deep_imports_of_studies),
+    "files of the spine": (43, spine),
+    "lines of the spine": (10_856, lines_of_spine),
+    f"functions above {LONGEST} lines": (21, long_functions),
+    **{f"names '{w}'": (most, partial(names_called, w)) for w, most in WORDS.items()},
+}
+"""Each figure's ceiling, and what it counts."""
+
+
+def main() -> None:
+    """Print each figure, its ceiling and what is counted."""
+    for name, (ceiling, count) in FIGURES.items():
+        items = count()
+        print(f"{name}: {len(items)} (at most {ceiling})")
+        if len(items) < 40:
+            for item, times in Counter(items).items():
+                print(f"    {item}" + (f" x {times}" if times > 1 else ""))
+
+
+if __name__ == "__main__":
+    main()
