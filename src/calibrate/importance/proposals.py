@@ -288,53 +288,40 @@ class WeightedPoints(ABC):
         return np.array([q.log_density(z) for q in self.proposals]).reshape(-1, len(z))
 
 
+LogDensities = Callable[[np.ndarray], Any]
+"""Points z (s, p) to a named tuple of log densities (s,), ``prior`` and ``likelihood``."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PosteriorPoints(WeightedPoints):
-    """Points of one posterior; ``at`` has the logarithms of ``prior`` and ``likelihood``.
+    """Points of one posterior, with the log densities of ``log_densities``."""
 
-    log_densities : the function from points z (s, p) to ``at``.
-    """
-
-    log_densities: Callable[[np.ndarray], Any]
+    log_densities: LogDensities
 
     @classmethod
     def of_proposal(
-        cls,
-        proposal: Kernels,
-        count: int,
-        rng: np.random.Generator,
-        log_densities: Callable[[np.ndarray], Any],
+        cls, proposal: Kernels, count: int, rng: np.random.Generator, log_densities: LogDensities
     ) -> Self:
         """Return ``count`` points from ``proposal``, and none from the prior."""
         z = proposal.sample(rng, count)
         return cls(
-            z=z,
-            at=log_densities(z),
-            priors=0,
-            proposals=(proposal,),
-            counts=(count,),
-            log_kernels=proposal.log_density(z)[None],
-            log_densities=log_densities,
-        )
+            z=z, at=log_densities(z), priors=0, proposals=(proposal,), counts=(count,),
+            log_kernels=proposal.log_density(z)[None], log_densities=log_densities,
+        )  # fmt: skip
 
     def densities(self, z: np.ndarray) -> Any:
-        """Return the log prior and log likelihood at points z (s, p)."""
+        """Return the log densities at points z (s, p)."""
         return self.log_densities(z)
 
     @property
     def log_posterior(self) -> np.ndarray:
-        """Log posterior density (s,) at the points, up to the evidence."""
+        """Log posterior density (s,) at the points, up to the evidence, their mean weight."""
         return np.asarray(self.at.prior + self.at.likelihood)
 
     @property
     def log_weights(self) -> np.ndarray:
         """Log weights (s,) of the posterior."""
         return self.log_posterior - self.log_mixture
-
-    @property
-    def log_evidence(self) -> float:
-        """Logarithm of the mean weight."""
-        return float(logsumexp(self.log_weights) - np.log(len(self.z)))
 
 
 def effective_number(log_weights: np.ndarray) -> float:

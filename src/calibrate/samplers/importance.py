@@ -204,8 +204,8 @@ class _Run:
                 "importance: the posterior density is zero at every point of a step; use nuts"
             )
         around = z[self._rng.choice(len(z), size=chosen, p=weights)]
-        kernels = self._kernels(around, widths, beside)
-        self.points = PosteriorPoints.of_proposal(kernels, count, self._rng, self._heights)
+        proposal = self._kernels(around, widths, beside)
+        self.points = PosteriorPoints.of_proposal(proposal, count, self._rng, self._heights)
 
     def _kernels(self, around: np.ndarray, widths: tuple[float, ...], beside: float) -> Kernels:
         """Return kernels around points (s, p), those nearest to each mode apart, and at modes.
@@ -274,7 +274,8 @@ def _evidence(populations: list[PosteriorPoints]) -> dict[str, float]:
     The variance of a mean weight is told by the weights, :math:`1 / n - 1 / s` of the square for
     :math:`s` points that are worth :math:`n`, and by how the populations differ; the larger counts.
     """
-    logarithms = np.array([points.log_evidence for points in populations])
+    sums = [np.logaddexp.reduce(points.log_weights) for points in populations]
+    logarithms = np.array(sums) - np.log([len(points.z) for points in populations])
     shifted, count = np.exp(logarithms - logarithms.max()), len(logarithms)
     mean = shifted.mean()
     within = [
