@@ -15,10 +15,7 @@ from pathlib import Path
 SRC = Path(__file__).resolve().parents[1] / "src"
 
 ROOMS = {
-    "hearts": (
-        *(f"emulator.geometry.{name}" for name in ("surfaces", "remeshing", "wall", "sheet")),
-        *(f"emulator.geometry.{name}" for name in ("two_surfaces", "heart", "left_wall")),
-    ),
+    "hearts": ("emulator.hearts",),
     "networks": (
         "emulator.surrogates.network.body",
         "emulator.surrogates.network.family",

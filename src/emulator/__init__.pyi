@@ -12,13 +12,13 @@ from .fem.unloading import Unloaded, Unloader, unload
 from .geometry import generators
 from .geometry.facets import Cavity
 from .geometry.fibres import wall_depth
-from .geometry.heart import mesh_heart
 from .geometry.io import Body, read_body, read_mesh, write_mesh, write_solution
 from .geometry.mesh import Mesh, boundary_facets
 from .geometry.random_field import matern_modes
-from .geometry.sheet import mesh_sheet, regions_within
 from .geometry.side_by_side import Bodies, side_by_side
-from .geometry.two_surfaces import mesh_wall
+from .hearts.heart import mesh_heart
+from .hearts.sheet import mesh_sheet, regions_within
+from .hearts.two_surfaces import mesh_wall
 from .mechanics import laws
 from .mechanics.laws import find_law
 from .scenes import Parameter, Scene, Support, loads, supports

@@ -6,7 +6,7 @@ from pathlib import Path
 import emulator as em
 from emulator.core.errors import InputError
 from emulator.geometry.io import write_mesh
-from emulator.geometry.surfaces import Surface, read_surface
+from emulator.hearts.surfaces import Surface, read_surface
 from emulator.scenes import Scene
 
 SURFACES = ("lv_endocardium", "rv_endocardium", "epicardium")

@@ -22,7 +22,7 @@ from calibrate.measurements.full_field import (
 from emulator.core.cells import read_cells
 from emulator.geometry.io import write_mesh
 from emulator.geometry.random_field import matern_modes
-from emulator.geometry.sheet import mesh_sheet, regions_within
+from emulator.hearts.sheet import mesh_sheet, regions_within
 from emulator.scenes import Scene
 from emulator.surrogates.protocol import ForwardMap
 

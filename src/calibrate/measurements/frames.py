@@ -29,7 +29,7 @@ from emulator.core.errors import InputError
 from emulator.core.units import MM3_PER_ML
 from emulator.geometry.facets import enclosed_volume, encloses, openings, rim
 from emulator.geometry.mesh import Mesh
-from emulator.geometry.surfaces import Surface
+from emulator.hearts.surfaces import Surface
 from emulator.scenes.scene import Scene, cavity_sets
 
 POINTS = 60

@@ -11,7 +11,7 @@ from calibrate.measurements.data import read_measurements, write_data
 from calibrate.measurements.frames import along_normals, frame_data, spread_evenly
 from cli_support import complaint
 from emulator.core.errors import InputError
-from emulator.geometry.surfaces import Surface, surface
+from emulator.hearts.surfaces import Surface, surface
 from scene_support import block
 from surface_support import write
 

@@ -15,7 +15,7 @@ from emulator.geometry.generators.box import box
 from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.geometry.io import read_body, read_mesh, read_regions
 from emulator.geometry.refinement import to_quadratic
-from emulator.geometry.surfaces import read_surface
+from emulator.hearts.surfaces import read_surface
 
 BLOCK = box((20.0, 10.0, 10.0), (4, 2, 2))
 SIDES = np.concatenate([BLOCK.facet_set(name) for name in ("left", "right", "top")])

@@ -63,7 +63,7 @@ def frames(arguments: Namespace) -> Answer:
     from calibrate.state_names import states_of
     from emulator.core.errors import look_up
     from emulator.core.units import IN_MM
-    from emulator.geometry.surfaces import read_surface
+    from emulator.hearts.surfaces import read_surface
 
     check_folder(Path(arguments.out).parent)
     if bool(arguments.field) is bool(arguments.surface):

@@ -165,9 +165,9 @@ _PLACE = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
 )
 def mesh(arguments: Namespace) -> Answer:
     """Mesh the wall, and write the mesh and its picture."""
-    from emulator.geometry.heart import mesh_heart
     from emulator.geometry.io import write_mesh
-    from emulator.geometry.two_surfaces import mesh_wall
+    from emulator.hearts.heart import mesh_heart
+    from emulator.hearts.two_surfaces import mesh_wall
 
     out, picture = arguments.out, arguments.picture
     words.check_vtu(out)

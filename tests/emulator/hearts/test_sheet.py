@@ -5,7 +5,7 @@ import pytest
 
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import discretise
-from emulator.geometry.sheet import mesh_sheet, regions_within
+from emulator.hearts.sheet import mesh_sheet, regions_within
 
 
 def rectangle(left, right, low, high):

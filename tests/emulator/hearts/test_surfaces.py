@@ -5,8 +5,8 @@ import pytest
 
 from emulator.core.errors import InputError
 from emulator.geometry.generators.ellipsoid import disc
-from emulator.geometry.remeshing import DiscMap, Remeshed
-from emulator.geometry.surfaces import (
+from emulator.hearts.remeshing import DiscMap, Remeshed
+from emulator.hearts.surfaces import (
     Surface,
     cut,
     inside,

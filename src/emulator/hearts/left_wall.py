@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 
 from emulator.core.errors import InputError
 from emulator.geometry.mesh import SIDES
-from emulator.geometry.surfaces import Surface, axis_to_rims, sampled
+from emulator.hearts.surfaces import Surface, axis_to_rims, sampled
 
 _FARTHEST = 1.3  # times the nearest distance
 _STEPS, _MET = 30, 0.05  # of the search along a normal, and the gap over the thickness that ends it

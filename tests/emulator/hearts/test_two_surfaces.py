@@ -18,8 +18,8 @@ from emulator.geometry.generators.ellipsoid import HUMAN, human_ventricle
 from emulator.geometry.io import write_mesh
 from emulator.geometry.mesh import signed_volumes
 from emulator.geometry.refinement import refined
-from emulator.geometry.surfaces import Surface, read_surface
-from emulator.geometry.two_surfaces import mesh_wall
+from emulator.hearts.surfaces import Surface, read_surface
+from emulator.hearts.two_surfaces import mesh_wall
 from emulator.scenes.draft import draft_scene
 from surface_support import INSIDE, OUTSIDE, ellipsoid, write
 
@@ -251,7 +251,7 @@ def test_without_gmsh_the_command_names_the_extra(rough, tmp_path, capsys, monke
     def no_library(name):
         raise OSError("libGLU.so.1: cannot open shared object file")
 
-    monkeypatch.setattr("emulator.geometry.remeshing.import_module", no_library)
+    monkeypatch.setattr("emulator.hearts.remeshing.import_module", no_library)
     assert "gmsh is installed but does not load (libGLU.so.1" in complaint(capsys, *words)
 
 

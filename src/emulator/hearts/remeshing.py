@@ -32,7 +32,7 @@ from scipy.spatial import cKDTree
 
 from emulator.core.errors import InputError
 from emulator.geometry.mesh import cross_sides
-from emulator.geometry.surfaces import Surface, closed, rim_loops, signed_areas
+from emulator.hearts.surfaces import Surface, closed, rim_loops, signed_areas
 
 _TYPES = {3: 2, 4: 4}  # Gmsh's numbers of element types, by their corners
 

@@ -14,7 +14,7 @@ import numpy as np
 from emulator.core.errors import InputError
 from emulator.geometry.generators.body import body, extrude, stacked
 from emulator.geometry.mesh import Mesh
-from emulator.geometry.remeshing import triangulate, within
+from emulator.hearts.remeshing import triangulate, within
 
 _GROWTH = 0.25  # of an edge's length, per length away from the pads
 _ON_A_SIDE = 1e-9  # of the sheet's extent, round-off of a place on a polygon

@@ -10,9 +10,9 @@ from emulator.core.errors import InputError
 from emulator.geometry.facets import Cavity
 from emulator.geometry.generators.biventricle import biventricle
 from emulator.geometry.generators.ellipsoid import HUMAN
-from emulator.geometry.heart import mesh_heart, zipped
-from emulator.geometry.remeshing import Unmeshable, triangulate
-from emulator.geometry.surfaces import Surface, clipped, rim_loops, surface
+from emulator.hearts.heart import mesh_heart, zipped
+from emulator.hearts.remeshing import Unmeshable, triangulate
+from emulator.hearts.surfaces import Surface, clipped, rim_loops, surface
 from emulator.scenes.draft import draft_scene
 from emulator.scenes.fibre_rules import Biventricle
 from surface_support import write

@@ -7,9 +7,9 @@ from cli_support import complaint
 from emulator.core.errors import InputError
 from emulator.geometry.generators.biventricle import biventricle
 from emulator.geometry.generators.ellipsoid import HUMAN
-from emulator.geometry.left_wall import left_wall
-from emulator.geometry.surfaces import Surface, read_surface, surface
-from emulator.geometry.two_surfaces import mesh_wall
+from emulator.hearts.left_wall import left_wall
+from emulator.hearts.surfaces import Surface, read_surface, surface
+from emulator.hearts.two_surfaces import mesh_wall
 from surface_support import write
 
 NAMES = {"endocardium": "lv_endocardium", "epicardium": "epicardium", "right": "rv_endocardium"}

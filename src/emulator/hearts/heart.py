@@ -34,8 +34,8 @@ from emulator.geometry.discretisation import mesh_quality
 from emulator.geometry.fibres import BOTH
 from emulator.geometry.mesh import SIDES, Mesh
 from emulator.geometry.refinement import to_linear
-from emulator.geometry.remeshing import DiscMap, Unmeshable, rim_loops, triangulate
-from emulator.geometry.surfaces import (
+from emulator.hearts.remeshing import DiscMap, Unmeshable, rim_loops, triangulate
+from emulator.hearts.surfaces import (
     Surface,
     area_vector,
     axes_across,
@@ -47,7 +47,7 @@ from emulator.geometry.surfaces import (
     sampled,
     smoothed,
 )
-from emulator.geometry.wall import (
+from emulator.hearts.wall import (
     Wall,
     distances,
     farthest,
@@ -106,7 +106,7 @@ def mesh_heart(
     Raises
     ------
     InputError
-        A surface that :func:`~emulator.geometry.surfaces.surface` refuses, or that is closed;
+        A surface that :func:`~emulator.hearts.surfaces.surface` refuses, or that is closed;
         openings that do not belong together; surfaces that are swapped, apart, or cross; lengths
         that are not in mm; no Gmsh; or a wall too thin for ``size`` mm, or for any.
     """

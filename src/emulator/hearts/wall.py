@@ -16,8 +16,8 @@ from emulator.geometry.discretisation import MeshQuality, discretise, mesh_quali
 from emulator.geometry.facets import Cavity
 from emulator.geometry.mesh import SIDES, Mesh, find_rows, orient
 from emulator.geometry.refinement import to_quadratic, unfolded
-from emulator.geometry.remeshing import DiscMap, Remeshed, Unmeshable, tetrahedralise
-from emulator.geometry.surfaces import Surface, place_of, read_surface
+from emulator.hearts.remeshing import DiscMap, Remeshed, Unmeshable, tetrahedralise
+from emulator.hearts.surfaces import Surface, place_of, read_surface
 
 _EXTENTS = 4.0, 600.0  # mm; nobody's heart is smaller or larger, a mouse's being 7 mm long
 _SMALLER = (

@@ -1,7 +1,7 @@
 r"""The wall of a left ventricle, meshed between two surfaces: endocardium and epicardium.
 
 Both are cut by the base plane, laid out in the disc and meshed anew with even triangles
-(:mod:`emulator.geometry.remeshing`); a flat annulus joins their rims, and Gmsh fills what they
+(:mod:`emulator.hearts.remeshing`); a flat annulus joins their rims, and Gmsh fills what they
 enclose. The long axis is the base plane's normal, from apex to base. Where it is not given it is
 the area vector of the rims, :math:`\frac12 \sum_\text{edges} x_a \times x_b`, and the plane lies
 as low as the lowest point of a rim, so that rims which are not flat, or not at one height, are cut
@@ -19,10 +19,10 @@ import numpy as np
 
 from emulator.core.errors import InputError, look_up
 from emulator.core.units import IN_MM, MM3_PER_ML
-from emulator.geometry.left_wall import left_wall
 from emulator.geometry.mesh import Mesh, signed_volumes
-from emulator.geometry.remeshing import DiscMap, Unmeshable, triangulate
-from emulator.geometry.surfaces import (
+from emulator.hearts.left_wall import left_wall
+from emulator.hearts.remeshing import DiscMap, Unmeshable, triangulate
+from emulator.hearts.surfaces import (
     Surface,
     axes_across,
     cut,
@@ -31,7 +31,7 @@ from emulator.geometry.surfaces import (
     place_of,
     smoothed,
 )
-from emulator.geometry.wall import (
+from emulator.hearts.wall import (
     Wall,
     distances,
     farthest,
@@ -69,7 +69,7 @@ def mesh_wall(
     ----------
     endocardium, epicardium : files of triangles (STL, PLY, OBJ), or surfaces in mm.
     right : the right ventricle's endocardium where the epicardium wraps both ventricles; the left
-        wall ends there (:mod:`emulator.geometry.left_wall`).
+        wall ends there (:mod:`emulator.hearts.left_wall`).
     size : the edge length in mm; by default 0.7 of the median thickness, or less where the wall
         is too thin for it.
     order : 2 for quadratic elements with curved edges on both surfaces, or 1.
@@ -84,7 +84,7 @@ def mesh_wall(
     Raises
     ------
     InputError
-        A surface that :func:`~emulator.geometry.surfaces.surface` refuses, with holes, or closed
+        A surface that :func:`~emulator.hearts.surfaces.surface` refuses, with holes, or closed
         without a base plane; surfaces that are swapped, apart, or cross; lengths that are not in
         mm; no Gmsh; or a wall too thin for ``size`` mm, or for any.
     """
