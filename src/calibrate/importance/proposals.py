@@ -288,8 +288,7 @@ class WeightedPoints(ABC):
         return np.array([q.log_density(z) for q in self.proposals]).reshape(-1, len(z))
 
 
-LogDensities = Callable[[np.ndarray], Any]
-"""Points z (s, p) to a named tuple of log densities (s,), ``prior`` and ``likelihood``."""
+LogDensities = Callable[[np.ndarray], Any]  # z (s, p) to log densities (s,): prior, likelihood
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

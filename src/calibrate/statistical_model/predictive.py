@@ -40,6 +40,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from scipy.linalg import eigh
 
 from calibrate.statistical_model.density import (
     BATCH,
@@ -195,6 +196,23 @@ def _fitted(
             scale = float(np.mean(square / variance))
             fitted = fitted._replace(length=length, nugget=nugget, scale=scale)
     return fitted, where_likely
+
+
+def gauss_newton_step(
+    gradient: np.ndarray, curvature: np.ndarray, prior_sd: np.ndarray, longest: float = np.inf
+) -> tuple[np.ndarray, float]:
+    """Return the Gauss-Newton step (p,) up a log posterior, and its expected gain.
+
+    gradient, curvature : as of :meth:`Predictive.curvature`.
+    longest : the length to which the step is shortened, in sd of the prior.
+    """
+    values, vectors = eigh(curvature * prior_sd * prior_sd[:, None])
+    # The prior's curvature is 1; where the likelihood is not concave, only the prior's is left.
+    slope = vectors.T @ (gradient * prior_sd)
+    along = slope / np.maximum(values, 1.0)
+    length = float(np.linalg.norm(along))
+    along *= min(1.0, longest / length) if length > 0.0 else 1.0
+    return prior_sd * (vectors @ along), float(along @ slope - 0.5 * along @ (values * along))
 
 
 class Evaluated(NamedTuple):

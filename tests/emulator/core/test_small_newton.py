@@ -77,7 +77,7 @@ def test_a_function_that_is_nowhere_finite():
     assert not bool(end.converged)
 
 
-def test_many_problems_end_where_each_does():
+def test_many_problems_end_where_each_does(strict):
     quadratic = lambda centre: quadratic_of(lambda x: rosenbrock(x - centre) + jnp.exp(x[0]))
     solve = lambda centre: minimise_by_newton(quadratic(centre), jnp.array([-1.2, 1.0]), low=-8.0)
     centres = jnp.array([[0.0, 0.0], [1.0, -2.0], [-5.0, 3.0], [jnp.nan, 0.0]])
