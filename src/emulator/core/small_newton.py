@@ -29,7 +29,6 @@ import jax.numpy as jnp
 from emulator.core.small_matrices import solve_modified
 
 _EVALUATIONS = 300  # an exponential law's exponent falls by about 1 in each, far away
-_TOLERANCE = 1e-9  # unknowns are of order 1
 _HIDDEN = 1e-6  # step whose decrease of the function may be less than round-off
 _ARMIJO = 1e-4
 _LEAST = 0.2  # share of the distance to a bound that a step leaves
@@ -70,12 +69,17 @@ class _Search(NamedTuple):
 
 
 def minimise_by_newton(
-    quadratic: Quadratic, start: jax.Array, low: jax.Array | float = -jnp.inf
+    quadratic: Quadratic,
+    start: jax.Array,
+    *,
+    low: jax.Array | float = -jnp.inf,
+    tolerance: float = 1e-9,
 ) -> NewtonMinimum:
     """Return the minimum that damped Newton steps descend to from ``start`` (u,).
 
     quadratic : value, slope and Hessian at a point; any may be infinite or NaN away from the start.
     low : lower bounds that no step reaches, () or (u,).
+    tolerance : the step below which the search ends; unknowns are of order 1.
     """
 
     def advance(search: _Search) -> _Search:
@@ -102,7 +106,7 @@ def minimise_by_newton(
         return chosen._replace(evaluations=search.evaluations + 1)
 
     def unfinished(search: _Search) -> jax.Array:
-        long = jnp.max(jnp.abs(search.step)) > _TOLERANCE
+        long = jnp.max(jnp.abs(search.step)) > tolerance
         return long & (search.evaluations < _EVALUATIONS)
 
     size, zero = len(start), jnp.zeros(())
@@ -117,6 +121,6 @@ def minimise_by_newton(
         evaluations=jnp.array(0),
     )
     end = jax.lax.while_loop(unfinished, advance, begin)
-    converged = (jnp.max(jnp.abs(end.step)) <= _TOLERANCE) & jnp.all(jnp.isfinite(end.x))
+    converged = (jnp.max(jnp.abs(end.step)) <= tolerance) & jnp.all(jnp.isfinite(end.x))
     hessian = jnp.where(converged, end.hessian, jnp.eye(size))
     return NewtonMinimum(jnp.where(converged, end.x, start), hessian, converged)
