@@ -95,7 +95,7 @@ def closest_points(
     corners = 4 if cells.shape[1] in (4, 10) else 3
     middles = cells.mean(axis=1)
     radii = _BEYOND * np.linalg.norm(cells - middles[:, None], axis=2).max(axis=1)
-    closest = []
+    indices, coordinates, closest = [], [], []
     for point in points:
         gaps = np.linalg.norm(middles - point, axis=1)
         least = gaps - radii  # no cell is closer than this
@@ -110,9 +110,10 @@ def closest_points(
             k = int(np.argmin(distances))
             if distances[k] < best[2]:
                 best = (int(rows[k]), inside[k], float(distances[k]))
-        closest.append(best)
-    rows, inside, distances = zip(*closest, strict=True)
-    return np.array(rows), np.array(inside), np.array(distances)
+        indices.append(best[0])
+        coordinates.append(best[1])
+        closest.append(best[2])
+    return np.array(indices, dtype=int), np.array(coordinates), np.array(closest)
 
 
 @partial(jax.jit, static_argnums=2)
