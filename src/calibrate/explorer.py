@@ -122,7 +122,7 @@ class Explorer:
         return result
 
     def compare(self, position: Mapping[str, str]) -> dict[str, Any]:
-        """Solve FEM at the same theta, and return the emulator's distance from it."""
+        """Solve FEM at the theta of the request, and return the emulator's distance from it."""
         theta = self.theta(position)
         with self._slow:
             solution = self._simulator.solve(theta, self._forward(theta))
@@ -171,7 +171,7 @@ class _PageHandler(Handler):
     """Answers one request to the explorer, the server's subject."""
 
     def do_GET(self) -> None:
-        """Answer with the page, or with what the page asks for."""
+        """Answer with the page, or with the data that the page asks for."""
         address, explorer = urlsplit(self.path), self.server.subject
         name = address.path.removeprefix("/")
         if self.is_foreign():
@@ -182,12 +182,12 @@ class _PageHandler(Handler):
             self.send(404, b"there are /, /at, /curve, /error and /compare\n", "text/plain")
         else:
             try:
-                found = getattr(explorer, name)(dict(parse_qsl(address.query)))
+                content = getattr(explorer, name)(dict(parse_qsl(address.query)))
             except InputError as fault:
                 self.send(400, f"{fault}\n".encode(), "text/plain; charset=utf-8")
                 return
-            plain = isinstance(found, bytes)
-            self.send(200, found, "application/octet-stream" if plain else "application/json")
+            plain = isinstance(content, bytes)
+            self.send(200, content, "application/octet-stream" if plain else "application/json")
 
 
 def serve(explorer: Explorer, port: int = 0) -> Server:

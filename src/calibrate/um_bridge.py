@@ -53,14 +53,14 @@ class ForwardModel:
                 "ModelNotFound", f"there is no model '{request.get('name')}', but '{NAME}'"
             )
         count, places = len(self.scene.parameters), list(self._outputs.places.values())
-        told: dict[str, dict[str, Any]] = {
+        descriptions: dict[str, dict[str, Any]] = {
             "InputSizes": {"inputSizes": [count]},
             "OutputSizes": {"outputSizes": self.output_sizes},
             "ModelInfo": {"support": {**dict.fromkeys(_EVALUATIONS, True), "ApplyHessian": False}},
             "TestShMem": {},  # memory that a client on this machine might share
         }
-        if what in told:
-            return told[what]
+        if what in descriptions:
+            return descriptions[what]
         if what not in _EVALUATIONS:
             raise _Fault("UnsupportedFeature", f"{what}: not offered")
         value = request["input"]

@@ -1,4 +1,4 @@
-"""Which effects a scene can do without: what each changes in what is observed, and what it costs.
+"""Effects that a scene can do without: the change of the observations, and the time, of each.
 
 Everything is measured by FEM, the whole scene's runs against the simpler scene's at the same theta.
 Effects that alone change every observation by no more than its tolerance, and whose absence saves
@@ -127,12 +127,12 @@ def recommend(
     alone = [compared.without((name,)) for name in effects]
     chosen: tuple[str, ...] = ()
     best = compared.without(())
-    for each in sorted(alone, key=lambda m: m.ratio):
-        if not each.within(limits) or each.ratio > _SAVES:
+    for effect in sorted(alone, key=lambda m: m.ratio):
+        if not effect.within(limits) or effect.ratio > _SAVES:
             continue
-        trial = compared.without((*chosen, *each.left_out))
+        trial = compared.without((*chosen, *effect.left_out))
         if trial.within(limits) and trial.ratio < _SAVES * best.ratio:
-            chosen, best = (*chosen, *each.left_out), trial
+            chosen, best = (*chosen, *effect.left_out), trial
     whole = judged = compared.without(())
     trials = 0
     while chosen:
@@ -209,7 +209,7 @@ class WithoutTerms:
         return self.of(names, lambda: leave_out(self._scene, names))
 
     def of(self, names: tuple[str, ...], make: Callable[[], Scene]) -> Measured:
-        """Return the comparison with another scene, whose parameters the whole one has, too."""
+        """Return the comparison with a scene whose parameters the whole scene has, too."""
         if names in self._known:
             return self._known[names]
         if names:
@@ -222,10 +222,10 @@ class WithoutTerms:
         onto = Onto(self._scene, simpler)
         first, _ = _clocked(simulator, simpler.centre)
         values, times, ratios, status = [], [], [], Status.CONVERGED
-        for own, theta in zip(onto.theta(self._thetas), self._thetas, strict=True):
+        for simpler_theta, theta in zip(onto.theta(self._thetas), self._thetas, strict=True):
             # Solvers keep factors of values they have seen: not the theta of the comparison again.
             whole_seconds = _clocked(whole, theta * (1.0 + _ASIDE))[0] if names else None
-            seconds, solution = _clocked(simulator, own)
+            seconds, solution = _clocked(simulator, simpler_theta)
             times.append(seconds)
             ratios.append(1.0 if whole_seconds is None else seconds / whole_seconds)
             status = Status(int(solution.status))

@@ -1,4 +1,4 @@
-r"""What data determined, with a prior and by likelihood alone, and what it says of the stress.
+r"""The parameters that data determine, with a prior and by likelihood alone, and the stress.
 
 **Combinations.** Stiffness and load can rise together and leave the body where it is; a table of
 marginals hides that. With covariances :math:`S` of the posterior and :math:`P` of the prior, in
@@ -82,7 +82,7 @@ def identify(posterior: Posterior) -> dict[str, Any]:
     x, prior = (np.asarray(model.on_scales(theta)) for theta in (after, prior_table(model)))
     contraction = 1.0 - x.std(axis=0, ddof=1) / prior.std(axis=0, ddof=1)
     correlation = np.atleast_2d(np.corrcoef(x, rowvar=False))
-    posterior_S, prior_S = (np.atleast_2d(np.cov(each, rowvar=False)) for each in (x, prior))
+    posterior_S, prior_S = (np.atleast_2d(np.cov(points, rowvar=False)) for points in (x, prior))
     ends = posterior.box_ends()
     cut = {end.name for end in ends}
     known = combinations(model, posterior_S, prior_S, after.mean(axis=0))
@@ -255,7 +255,7 @@ def profile_likelihood(posterior: Posterior, name: str, points: int = 21) -> Pro
 
 
 def _crossing(values: np.ndarray, drop: np.ndarray, otherwise: float) -> float:
-    """Return where the drop first crosses :data:`DROP_95`."""
+    """Return the value at which the drop first crosses :data:`DROP_95`."""
     beyond = np.flatnonzero(drop > DROP_95)
     if not beyond.size:
         return otherwise

@@ -1,4 +1,4 @@
-r"""Simulation-based calibration: whether posteriors mean what they say.
+r"""Simulation-based calibration: a check that credible intervals cover as often as they claim.
 
 Draw :math:`\theta^* \sim p(\theta)` and data :math:`y \sim p(y \mid \theta^*)`, and sample
 :math:`p(\theta \mid y)`. If model, forward map and sampler are right, :math:`\theta^*` and the L
@@ -100,8 +100,8 @@ class Calibration:
         All q functions of a right posterior stay inside together with ``probability`` at least:
         each has a band of :math:`1 - (1 - \text{probability}) / q` (Bonferroni).
         """
-        each = 1.0 - (1.0 - probability) / len(self.ranks)
-        return {name: self.band(name, each).outside for name in self.ranks}
+        band_probability = 1.0 - (1.0 - probability) / len(self.ranks)
+        return {name: self.band(name, band_probability).outside for name in self.ranks}
 
     @property
     def passed(self) -> bool:
@@ -109,7 +109,7 @@ class Calibration:
         return not any(self.outside().values())
 
     def coverage(self, probability: float = 0.95) -> dict[str, dict[float, tuple[float, ...]]]:
-        """Return the share of central intervals that cover, with its own interval, by quantity.
+        """Return the fraction of central intervals that cover, with its error bounds, by quantity.
 
         The interval is Clopper and Pearson's, of ``probability``.
         """
@@ -230,10 +230,10 @@ def sbc(
         return {name: values[rows] for name, values in every.items()}
 
     data_sets = predictions.prior_replicates(truth, jax.random.key(seed), replicates)
-    if (found := len(data_sets.draws[truth.names[0]])) < _FEWEST:
-        raise InputError(f"calibration: {predictions.shortfall(found, replicates)[0]}")
-    each = _replicates(model, data_sets, draw or sampled, seed, progress=progress)
-    return calibration_of(each, seed)
+    if (count := len(data_sets.draws[truth.names[0]])) < _FEWEST:
+        raise InputError(f"calibration: {predictions.shortfall(count, replicates)[0]}")
+    ranks = _replicates(model, data_sets, draw or sampled, seed, progress=progress)
+    return calibration_of(ranks, seed)
 
 
 def _replicates(
@@ -253,7 +253,7 @@ def _replicates(
 def _log_likelihoods(
     model: Model, draws: Mapping[str, Any], data: Mapping[str, np.ndarray]
 ) -> np.ndarray:
-    """Log likelihood of the data at draws of any shape, of their shape."""
+    """Return the log likelihood of the data at draws of any shape, in this shape."""
     shape = np.shape(draws[model.names[0]])
     table = {name: np.reshape(draws[name], (1, -1)) for name in model.names}
     terms = predictions.log_likelihood(model, table, data)

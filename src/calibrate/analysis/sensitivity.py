@@ -1,4 +1,4 @@
-r"""Sensitivity of what a forward map predicts, or any function of independent parameters.
+r"""Sensitivity of the outputs of a forward map, or of any function of independent parameters.
 
 With :math:`y = g(x)`, x uniform in the unit cube and :math:`V` the variance of y,
 
@@ -91,7 +91,7 @@ class Factors:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """The names of what varies independently, in the order of their first parameters."""
+        """The names of groups and single parameters, in the order of their first parameters."""
         return tuple(dict.fromkeys(self.group_of))
 
     @property
@@ -128,7 +128,7 @@ def densities(prior: Prior, names: Sequence[str], theta: jax.Array) -> jax.Array
 
 
 METHODS = ("sobol", "morris", "derivatives")
-"""Variance-based indices, screening, and what exact derivatives say."""
+"""Variance-based indices, screening, and derivative-based measures."""
 
 Function = Callable[[np.ndarray], np.ndarray]
 """Points (n, p) of the unit cube to outputs (n, m)."""
@@ -262,7 +262,7 @@ def _by_screening(
         )  # fmt: skip
         for name, key in names.items():
             effects[name][:, k] = np.ma.filled(np.ma.asarray(result[key], dtype=float), np.nan)
-    data: dict[str, Any] = {name: (("factor", "output"), each) for name, each in effects.items()}
+    data: dict[str, Any] = {name: (("factor", "output"), x) for name, x in effects.items()}
     return data | {
         "mu_star_together": ("factor", np.sqrt(np.mean(effects["mu_star"] ** 2, axis=1)))
     }
@@ -311,7 +311,7 @@ def sensitivity(
     field: bool = False,
     seed: int = 0,
 ) -> xr.DataTree:
-    """Return how much each parameter moves each observation.
+    """Return the sensitivity of each observation to each parameter.
 
     Parameters
     ----------

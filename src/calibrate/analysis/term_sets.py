@@ -55,7 +55,10 @@ def seen_columns(G: np.ndarray) -> np.ndarray:
 
 
 def posterior_of_sets(G: np.ndarray, y: np.ndarray, names: Sequence[str]) -> SetPosterior:
-    """Return the posterior of the sets of those columns ``names`` of G (n, p) that are not zero."""
+    """Return the posterior probability of every subset of candidate terms.
+
+    Columns of the design matrix G (n, p) that are zero are left out, with their ``names``.
+    """
     seen = seen_columns(G)
     G, names = G[:, seen], [names[k] for k in seen]
     size, p = float(np.sqrt(np.mean(y**2))), G.shape[1]
@@ -71,15 +74,15 @@ def posterior_of_sets(G: np.ndarray, y: np.ndarray, names: Sequence[str]) -> Set
         logs = 0.5 * (fits[:, None] - np.sum(y**2)) / sds**2 - len(y) * np.log(sds)
         logs += (prior - 0.5 * counts * np.log1p(len(y)))[:, None]
         # The likeliest sets of moduli of any sign may need negative ones: the best is known last.
-        found, best = np.full_like(logs, -np.inf), -np.inf
+        evidence, best = np.full_like(logs, -np.inf), -np.inf
         most = logs + counts[:, None] * np.log(2.0)
         for place in np.argsort(-most, axis=None):
             i, j = np.unravel_index(place, logs.shape)
             if most[i, j] < best - within:
                 break
-            found[i, j] = logs[i, j] + least_squares.log_positive(sets[i], sds[j])
-            best = max(best, found[i, j])
-        return found
+            evidence[i, j] = logs[i, j] + least_squares.log_positive(sets[i], sds[j])
+            best = max(best, evidence[i, j])
+        return evidence
 
     coarse = np.geomspace(1e-3 * size, size / 3.0, _NOISES)
     near = coarse[np.argmax(log_evidence(coarse, 0.0).max(axis=0))]
@@ -130,24 +133,24 @@ class SetPosterior:
 
     @property
     def moments(self) -> dict[str, tuple[float, float]]:
-        """Mean and sd in kPa of each modulus where its term is present, signs not regarded."""
+        """Mean and sd in kPa of each modulus given that its term is present, without its sign."""
         sums = np.zeros((len(self.names), 3))
         for i, j in np.argwhere(self.weights > 1e-4 * self.weights.max()):
             if S := list(self.sets[i]):
                 mean, inverse = self.least_squares.of(S)
                 second = self.sds[j] ** 2 * np.diag(inverse) + mean**2
                 sums[S] += self.weights[i, j] * np.stack([np.ones(len(S)), mean, second], axis=1)
-        found = {}
+        moments = {}
         for k in np.flatnonzero(sums[:, 0] > 0.0):
             mean, second = sums[k, 1:] / sums[k, 0]
             sd = np.sqrt(max(second - mean**2, 0.0))
-            found[self.names[int(k)]] = float(mean / self.units[k]), float(sd / self.units[k])
-        return found
+            moments[self.names[int(k)]] = float(mean / self.units[k]), float(sd / self.units[k])
+        return moments
 
     def predicted(self, i: int, data: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return how the set numbered i predicts other data (k,), in sds of their noise.
+        """Predict other data (k,) by the set numbered i, in sds of their noise.
 
-        Returned are the mean, the probability of less and the log density of each point, (k,).
+        Return the mean, the probability of less and the log density of each point, (k,).
 
         columns : the data (k, p) that one unit of each modulus makes.
         """
@@ -167,7 +170,7 @@ class SetPosterior:
 
 @dataclass(frozen=True)
 class _LeastSquares:
-    """The data's share in columns of length 1.
+    """The normal equations of the data in columns of length 1.
 
     gram : G^T G, (p, p). projected : G^T y, (p,). count : the number n of data.
     """

@@ -76,7 +76,7 @@ class Certificate(TableRepr):
 
     def summary_rows(self) -> tuple[str, list[tuple[str, str]]]:
         """Return title and rows of the table: verdict, findings, and the number of FEM runs."""
-        rows = [("verdict", str(self.verdict)), *(("finding", each) for each in self.findings)]
+        rows = [("verdict", str(self.verdict)), *(("finding", text) for text in self.findings)]
         return "Certificate", [*rows, ("FEM runs", str(self.evidence.physics.runs))]
 
     @property
@@ -174,7 +174,7 @@ def judge(evidence: Evidence) -> Certificate:
 
 
 def _mesh(mesh: MeshChange) -> tuple[bool | None, list[Finding]]:
-    """Return whether the posterior stays on a finer mesh, ``None`` if undecided, and findings."""
+    """Return whether a finer mesh keeps the posterior, ``None`` if undecided, and findings."""
     if mesh.homogeneous:
         remedy = _SAY_GRIPS if mesh.homogeneous == NOBODY_SAID else ""
         return True, [(f"grips: the piece is taken to deform evenly, {mesh.homogeneous}", remedy)]
@@ -219,7 +219,7 @@ def _agreement(evidence: Evidence) -> tuple[Verdict, list[Finding]]:
     if agree:
         worst = max((abs(f.value) for f in draws.shift.values()), default=0.0)
         return "accepted", [(f"no mean moves by more than {worst:.2f} posterior sd", "")]
-    decisive = [each for each in comparisons if each[1].within(each[2]) is agree]
+    decisive = [row for row in comparisons if row[1].within(row[2]) is agree]
     if agree is None:
         factor = max(figure.factor_to_decide(limit) for _, figure, limit in decisive)
         runs = evidence.physics.runs * factor
@@ -265,7 +265,7 @@ def _weights(tail: Tail) -> tuple[Verdict, list[Finding]] | None:
 
 
 def _faults(evidence: Evidence) -> Iterator[Finding]:
-    """Yield what is wrong with FEM at the draws, and with the data, whatever FEM says of them."""
+    """Yield the faults of FEM at the draws and of the data; the figures play no part in them."""
     p = evidence.physics
     if evidence.box:
         yield in_words(evidence.box)

@@ -20,7 +20,7 @@ _UNLIMITED = 1_000_000  # columns when the output is a file or a pipe
 
 
 def check_plotly(what: str) -> None:
-    """Refuse ``what`` needs Plotly in one line, where that is missing."""
+    """Raise InputError for ``what``, which needs Plotly, where Plotly is missing."""
     if find_spec("plotly") is None:
         raise InputError(f"{what} needs plotly: pip install 'soft-tissue-calibrate[plot]'")
 
@@ -37,12 +37,12 @@ def table(header: Sequence[str], rows: Iterable[Sequence[object]], width: int | 
         width = shutil.get_terminal_size((_UNLIMITED, 24)).columns
     first, taken = [cell.ljust(widths[0]) for cell in columns[0]], widths[0]
     blocks = [[first]]
-    for column, own in zip(columns[1:], widths[1:], strict=True):
-        if len(blocks[-1]) > 1 and taken + 2 + own > width:
+    for column, column_width in zip(columns[1:], widths[1:], strict=True):
+        if len(blocks[-1]) > 1 and taken + 2 + column_width > width:
             blocks.append([first])
             taken = widths[0]
-        blocks[-1].append([cell.rjust(own) for cell in column])
-        taken += 2 + own
+        blocks[-1].append([cell.rjust(column_width) for cell in column])
+        taken += 2 + column_width
     return "\n\n".join(
         "\n".join("  ".join(line).rstrip() for line in zip(*block, strict=True)) for block in blocks
     )

@@ -92,7 +92,7 @@ def _add_run(parser: ArgumentParser, more: Sequence[str]) -> None:
 
 
 def plan_of(arguments: Namespace) -> Run | Problem | Members:
-    """Return what :func:`run_options` read: a run, or an experiment file's problem or members."""
+    """Return the run, or the experiment file's problem or members, from :func:`run_options`."""
     from calibrate.project.experiment import is_experiment_file, read_experiment
     from calibrate.project.run import SYNTHETIC, Run, with_absolute_paths
 
@@ -114,8 +114,8 @@ def plan_of(arguments: Namespace) -> Run | Problem | Members:
         entries["scene"], entries["root"] = scene_words(arguments)
     # An option that is not given leaves the run's default, or the file's entry, as it is.
     nonempty = {name: value for name, value in entries.items() if value is not None and value != {}}
-    given = with_absolute_paths(nonempty)
-    return read_experiment(arguments.scene, given) if in_file else Run(**given)
+    run_fields = with_absolute_paths(nonempty)
+    return read_experiment(arguments.scene, run_fields) if in_file else Run(**run_fields)
 
 
 def problem_of(arguments: Namespace) -> Problem:

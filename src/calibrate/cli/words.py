@@ -47,11 +47,11 @@ class Parser(ArgumentParser):
             self.register("action", name, _Once)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Return what :mod:`argparse` does."""
-        found, rest = super().parse_known_args(args, namespace)
-        if hasattr(found, _SEEN):
-            delattr(found, _SEEN)
-        return found, rest
+        """Parse as :mod:`argparse` does, without its record of repeated options."""
+        arguments, rest = super().parse_known_args(args, namespace)
+        if hasattr(arguments, _SEEN):
+            delattr(arguments, _SEEN)
+        return arguments, rest
 
     def error(self, message: str) -> NoReturn:
         """Raise the message as an :class:`InputError`."""
@@ -91,8 +91,8 @@ def command(*options: Option, **about: str) -> Callable[[Callable[[Namespace], A
     def made_of(run: Callable[[Namespace], Answer]) -> Command:
         def add(commands: Any, name: str) -> None:
             parser = commands.add_parser(name, **about)
-            for each in options if JSON in options else (*options, JSON):
-                each(parser)
+            for add_option in options if JSON in options else (*options, JSON):
+                add_option(parser)
             parser.set_defaults(run=run)
 
         return add
@@ -113,12 +113,12 @@ def command_of_kinds(about: str, **kinds: Command) -> Command:
 
 
 def option(flag: str, metavar: Any = None, help: str | None = None, **about: Any) -> Option:
-    """Return what adds one option, as :mod:`argparse` describes it."""
+    """Return the function that adds one option, with the arguments of :mod:`argparse`."""
     return lambda parser: parser.add_argument(flag, metavar=metavar, help=help, **about)
 
 
 def flag(name: str, text: str) -> Option:
-    """Return what adds an option without a value."""
+    """Return the function that adds an option without a value."""
     return lambda parser: parser.add_argument(name, action="store_true", help=text)
 
 
@@ -189,9 +189,9 @@ def add_forward(parser: ArgumentParser, default: str | None = "emulator") -> Non
 
     kinds = "; ".join(f"{kind.name}: {kind.help}" for kind in FORWARD_MAPS.values())
     parser.add_argument("--forward", choices=tuple(FORWARD_MAPS), default=default, help=kinds)
-    for each, _ in known_options().values():
-        text = f"{each.help} (default {each.default})"
-        parser.add_argument(each.flag, type=int, metavar="N", help=text)
+    for option, _ in known_options().values():
+        text = f"{option.help} (default {option.default})"
+        parser.add_argument(option.flag, type=int, metavar="N", help=text)
 
 
 def forward_options(arguments: Namespace) -> dict[str, int]:

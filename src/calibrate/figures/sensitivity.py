@@ -18,16 +18,16 @@ _INSIDE, _OUTSIDE, _BAND = BLUE, VERMILION, "0.85"  # blue and vermilion differ 
 
 
 def draw_calibration(calibration: Calibration, title: str, path: str | Path) -> None:
-    """Draw each quantity's distribution function of ranks less the uniform one, with its band.
+    """Draw the difference of each quantity's distribution of ranks to the uniform one, and a band.
 
     A hump above zero: truths lie low among the draws. Steep ends, flat middle: the posterior is too
     narrow. Flat ends, steep middle: it is too wide.
     """
     names, outside = list(calibration.ranks), calibration.outside()
     figure, grid = panels(len(names), 3, (3.6, 2.9), sharex=True)
-    each = 1.0 - 0.05 / len(names)
+    probability = 1.0 - 0.05 / len(names)
     for axes, name in zip(grid.flat, names, strict=False):
-        band = calibration.band(name, each)
+        band = calibration.band(name, probability)
         axes.fill_between(band.x, band.low - band.x, band.high - band.x, color=_BAND, lw=0)
         color = _OUTSIDE if outside[name] else _INSIDE
         axes.step(band.x, band.ecdf - band.x, where="post", color=color, lw=1.4)

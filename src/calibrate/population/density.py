@@ -171,12 +171,12 @@ def density_of_population(model: PopulationModel) -> PopulationDensity:
 
     def constrain(z: jax.Array, information: Information) -> Any:
         values, population, _ = with_scores(z, information)
-        own = {
+        member_values = {
             f"{name}[{member}]": transforms[f"{name}[{member}]"](values[f"{name}[{member}]"])
-            for member, names in model.own.items()
+            for member, names in model.unshared.items()
             for name in names
         }
-        return population, values[SCORES], own
+        return population, values[SCORES], member_values
 
     return PopulationDensity(
         log_density,

@@ -151,7 +151,7 @@ class PopulationModel:
         draws = {}
         for i, (member, model) in enumerate(self.members.items()):
             draws[member] = {name: values[name][i] for name in self.shared}
-            for name in self.own[member]:
+            for name in self.unshared[member]:
                 prior = model.given_earlier(name, model.sampled_priors[name], draws[member])
                 draws[member][name] = numpyro.sample(f"{name}[{member}]", prior)
         data = data or {}
@@ -166,7 +166,7 @@ class PopulationModel:
             numpyro.factor(f"data of {', '.join(names)}", jnp.sum(log_likelihoods))
 
     @cached_property
-    def own(self) -> dict[str, tuple[str, ...]]:
+    def unshared(self) -> dict[str, tuple[str, ...]]:
         """Unknowns that do not follow the population, by member."""
         return {
             member: tuple(name for name in model.sampled_priors if name not in self.shared)
@@ -225,8 +225,8 @@ def population_model(
         raise InputError("hierarchy: no members; give a model and data by member's name")
     names = _shared_names(members, shared)
     parameters = {name: _common_parameter(members, name) for name in names}
-    for member, each in members.items():
-        tied = () if each.dependence is None else each.dependence.names
+    for member, model in members.items():
+        tied = () if model.dependence is None else model.dependence.names
         if len({name in names for name in tied}) > 1:
             raise InputError(
                 f"hierarchy: the prior of member '{member}' correlates {', '.join(tied)}, of which "
@@ -246,13 +246,13 @@ def population_model(
         kind = log_normal if parameter.scale == "log" else truncated_normal
         usual = kind(middle, half, parameter.low, parameter.high)
         medians[name] = (median or {}).get(name, usual)
-        given = (spread or {}).get(name, 0.5 * half)
-        if not (isinstance(given, dist.Distribution) or 0.0 < given < math.inf):
+        prior = (spread or {}).get(name, 0.5 * half)
+        if not (isinstance(prior, dist.Distribution) or 0.0 < prior < math.inf):
             raise InputError(
-                f"hierarchy: spread of '{name}' is {given}; give a number above 0, or a "
+                f"hierarchy: spread of '{name}' is {prior}; give a number above 0, or a "
                 "distribution"
             )
-        spreads[name] = given if isinstance(given, dist.Distribution) else dist.HalfNormal(given)
+        spreads[name] = prior if isinstance(prior, dist.Distribution) else dist.HalfNormal(prior)
     cut = truncated(medians, next(iter(members.values())).forward.scene)
     return PopulationModel(dict(members), parameters, cut, spreads, float(eta))
 
@@ -274,17 +274,17 @@ def _shared_names(members: Mapping[str, Model], names: Sequence[str] | None) -> 
     if not names or len(set(names)) != len(names) or isinstance(names, str):
         raise InputError(f"hierarchy: shared is {names!r}; give one or more names, each once")
     for name in names:
-        for member, own in unknowns.items():
-            if name not in own:
+        for member, inferred in unknowns.items():
+            if name not in inferred:
                 raise InputError(
                     f"hierarchy: member '{member}' does not infer '{name}'; it infers "
-                    f"{', '.join(own)}"
+                    f"{', '.join(inferred)}"
                 )
     return tuple(names)
 
 
 def _common_parameter(members: Mapping[str, Model], name: str) -> Parameter:
-    """Return the parameter of the unknown ``name``, which has to be the same for every member."""
+    """Return the parameter of the unknown ``name``; InputError where members differ in it."""
     scenes = {member: model.forward.scene for member, model in members.items()}
     base = split(name)[0]
     parameters = {m: s.parameters[s.parameter_names.index(base)] for m, s in scenes.items()}

@@ -171,8 +171,8 @@ class Hierarchy(TableRepr):
                 box[name] = Parameter(name, about["units"], low, high, about["scale"])
         ends = []
         for member in self.members:
-            found = box_ends(self.member(member), box)
-            ends += [replace(end, name=f"{end.name}[{member}]") for end in found]
+            member_ends = box_ends(self.member(member), box)
+            ends += [replace(end, name=f"{end.name}[{member}]") for end in member_ends]
         return sorted(ends, key=lambda end: -end.shift)
 
     def save(self, path: str | Path) -> None:
@@ -202,7 +202,7 @@ def make_tree(
     draws : population, scores and own unknowns (s, ...), of ``shape`` (chains, draws).
     rng_key : the key of the member not seen.
     """
-    population, scores, own = draws
+    population, scores, member_values = draws
     new = jax.random.normal(rng_key, (len(scores), scores.shape[-1]))
     values = density_of_population(model).values
     correlation = np.einsum("...ik,...jk->...ij", population.factor, population.factor)
@@ -211,7 +211,7 @@ def make_tree(
         SD: population.sd,
         CORRELATION: correlation,
         **values(*population, scores),
-        **own,
+        **member_values,
     }
 
     def by_chain(draws: Mapping[str, Any]) -> dict[str, np.ndarray]:

@@ -131,16 +131,16 @@ def _alone(
 ) -> dict[str, dict[str, np.ndarray]]:
     """Return draws (s,) of shared unknowns by member, each alone; from its prior without data."""
     by_member = {}
-    for i, (member, own) in enumerate(model.members.items()):
+    for i, (member, member_model) in enumerate(model.members.items()):
         if member in data:
             values = {name: np.asarray(y) for name, y in data[member].items()}
             posterior = sample(
-                own, values, sampler=sampler, seed=seed + i, progress=progress,
+                member_model, values, sampler=sampler, seed=seed + i, progress=progress,
                 predictions=False,
             )  # fmt: skip
             draws: Mapping[str, Any] = posterior.draws()
         else:
-            draws = own.prior_draws(jax.random.key(seed + i), _PRIOR_DRAWS)
+            draws = member_model.prior_draws(jax.random.key(seed + i), _PRIOR_DRAWS)
         by_member[member] = {name: np.asarray(draws[name]) for name in model.shared}
     return by_member
 
@@ -150,12 +150,13 @@ def _information(
 ) -> Information:
     """Return the information of each member's data, from its posterior alone and its prior."""
     rows, priors = [], {}
-    for member, own in model.members.items():
+    for member, member_model in model.members.items():
         draws = _on_scales(model, alone[member])
-        if member in data and id(own) not in priors:
+        if member in data and id(member_model) not in priors:
             key = jax.random.fold_in(jax.random.key(0), _OF_PRIOR)
-            priors[id(own)] = _on_scales(model, own.prior_draws(key, _PRIOR_DRAWS))
-        rows.append(information_of(draws, priors[id(own)] if member in data else draws))
+            prior_draws = member_model.prior_draws(key, _PRIOR_DRAWS)
+            priors[id(member_model)] = _on_scales(model, prior_draws)
+        rows.append(information_of(draws, priors[id(member_model)] if member in data else draws))
     return Information(*(jnp.stack(column) for column in zip(*rows, strict=True)))
 
 
@@ -168,7 +169,7 @@ def _on_scales(model: PopulationModel, draws: Mapping[str, Any]) -> np.ndarray:
 def _provenance(
     model: PopulationModel, options: NUTSOptions, alone: str, seed: int
 ) -> dict[str, Any]:
-    """Return what a posterior was made of, as plain JSON values."""
+    """Return the priors, maps and settings behind a posterior, as plain JSON values."""
     return {
         "shared": list(model.shared),
         "prior_median": {name: describe_distribution(d) for name, d in model.median.items()},
@@ -176,11 +177,11 @@ def _provenance(
         "eta": model.eta,
         "members": {
             member: {
-                "scene_fingerprint": own.forward.scene.fingerprint,
-                "forward_fingerprint": own.full.fingerprint,
-                "prior": {name: describe_distribution(d) for name, d in own.prior.items()},
+                "scene_fingerprint": member_model.forward.scene.fingerprint,
+                "forward_fingerprint": member_model.full.fingerprint,
+                "prior": {name: describe_distribution(d) for name, d in member_model.prior.items()},
             }
-            for member, own in model.members.items()
+            for member, member_model in model.members.items()
         },
         "sampler_options": asdict(options),
         "alone": alone,

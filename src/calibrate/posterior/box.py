@@ -1,4 +1,4 @@
-r"""Whether the ends of a box prior, and not the data, end a posterior.
+r"""Detection of posteriors that end at the ends of a box prior instead of by the data.
 
 A parameter without a prior has its scene's range as one, a box. Often that range is a guess. Where
 the data want more than it allows, draws gather at its end, closer together than the data alone
@@ -94,18 +94,18 @@ def box_ends(draws: Mapping[str, np.ndarray], box: Mapping[str, Parameter]) -> l
         sd = float(np.sqrt(d @ covariance @ d))
         if not 0.0 < sd < _OPEN * np.sqrt((d**2).sum() / 12.0):
             continue
-        up, down = (_exit(x, each, wider, _FAR * sd) for each in (d, -d))
+        up, down = (_exit(x, direction, wider, _FAR * sd) for direction in (d, -d))
         shift = (up.mass * up.beyond - down.mass * down.beyond) / (1.0 + up.mass + down.mass)
         if abs(shift) <= LARGEST_SHIFT * sd:
             continue
         for end in (up if shift > 0.0 else down).ends:
             worst[end] = max(worst.get(end, 0.0), min(abs(shift) / sd, _FAR))
-    found = []
+    ends = []
     for (k, at_high), shift in sorted(worst.items(), key=lambda item: -item[1]):
         parameter = box[names[k]]
         value = parameter.high if at_high else parameter.low
-        found.append(BoxEnd(names[k], value, parameter.unit, shift))
-    return found
+        ends.append(BoxEnd(names[k], value, parameter.unit, shift))
+    return ends
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class _Exit:
 
 
 def in_words(ends: Sequence[BoxEnd]) -> tuple[str, str]:
-    """Return what the ends do to the posterior, and what to do about it, of one end or more."""
+    """Return a sentence on the effect of these ends on the posterior, and its remedy."""
     shift = max(end.shift for end in ends)
     by = f"{shift:.1f} sd" if shift < 0.9 * _FAR else f"about {_FAR:.0f} sd or more"
     # Without the load state, pressure@p8, and without the member of a population, mu[beam1].
@@ -137,7 +137,7 @@ def in_words(ends: Sequence[BoxEnd]) -> tuple[str, str]:
 
 
 def _exit(x: np.ndarray, d: np.ndarray, wider: np.ndarray, farthest: float) -> _Exit:
-    """Return what lies beyond the box along ``d`` (q,) from positions x (s, q).
+    """Return the mass beyond the box along ``d`` (q,) from positions x (s, q).
 
     wider : how far each lower and each upper side moves out, (2, q). farthest : how far at most.
     """

@@ -1,4 +1,4 @@
-r"""The draws in a few numbers, and what is wrong with a run or with its data, in words.
+r"""A summary of draws in a few numbers, and sentences on the faults of a run and of its data.
 
 Data simulated from draws of the posterior tell whether the data could have come from the model.
 Distances of simulated and measured data from a prediction say how much of the one is as far off as
@@ -55,7 +55,7 @@ _NAMED = 3  # largest number of parameters that a sentence names
 
 
 Fault = tuple[str, str]
-"""A statement about what is wrong, and a remedy; empty where there is none."""
+"""A statement about a fault, and a remedy; the remedy may be empty."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Sampling:
 
 
 def sampling_faults(s: Sampling, box: Sequence[BoxEnd] = ()) -> Iterator[Fault]:
-    """Yield what makes draws useless for a certificate; NaN is at fault.
+    """Yield the faults that make draws useless for a certificate; NaN counts as a fault.
 
     box : the ends of ranges that end the posterior, so that no prior is to be narrowed.
     """
@@ -100,7 +100,7 @@ def sampling_faults(s: Sampling, box: Sequence[BoxEnd] = ()) -> Iterator[Fault]:
 
 
 def map_fault(errors: Mapping[str, float], moves: float = np.nan) -> Fault | None:
-    """Return what the forward map misses most, if by more than a share of the noise or of a mean.
+    """Return the fault of the forward map, if its error exceeds limits on data or on means.
 
     errors : the distance of the map's data from FEM's at the draws, in noise sd, by observation.
     moves : the largest move of a posterior mean that FEM is expected to make, in its sd; NaN where
@@ -114,8 +114,8 @@ def map_fault(errors: Mapping[str, float], moves: float = np.nan) -> Fault | Non
         f"{value:.2g} {unit}" if np.isfinite(value) else "an unknown amount"
         for value, unit in ((sizes[worst], "noise sd"), (moves, "sd"))
     )
-    told = f", and FEM in its place would move a mean by {most}"
-    most = told if moves > LARGEST_MAP_MOVE else ""
+    consequence = f", and FEM in its place would move a mean by {most}"
+    most = consequence if moves > LARGEST_MAP_MOVE else ""
     return (
         f"the forward map misses FEM by {size} in {worst} at the draws{most}",
         "infer with --forward corrected (or more of its --steps), or let the map's error widen the "
@@ -130,7 +130,7 @@ class Summary(dict[str, dict[str, float]]):
         """Return a line for each parameter, numbers to four digits."""
         columns = list(next(iter(self.values()), {}))
         rows = [["", *columns]]
-        rows += [[name, *(f"{row[each]:.4g}" for each in columns)] for name, row in self.items()]
+        rows += [[name, *(f"{row[c]:.4g}" for c in columns)] for name, row in self.items()]
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         lines = []
         for row in rows:
@@ -170,7 +170,7 @@ def diagnose(
     attributes: Mapping[str, Any],
     box: Sequence[BoxEnd] = (),
 ) -> Iterator[str]:
-    """Yield a sentence for each thing that is wrong, with what to do; nothing if nothing is.
+    """Yield one sentence per problem, with its remedy. Yield nothing for a healthy run.
 
     Parameters
     ----------
@@ -262,9 +262,9 @@ def nothing_learned(tree: xr.DataTree, unknowns: Sequence[str], noise: str) -> l
         np.stack([np.ravel(tree[group][name]) for name in unknowns])
         for group in ("prior", "posterior")
     )
-    moved = max(ks_2samp(*rows).statistic for rows in zip(before, after, strict=True))
+    statistic = max(ks_2samp(*rows).statistic for rows in zip(before, after, strict=True))
     least = np.sqrt(eigvalsh(np.atleast_2d(np.cov(after)), np.atleast_2d(np.cov(before)))[0])
-    if not (least >= _LITTLE_SD and moved <= _LITTLE_MOVED):
+    if not (least >= _LITTLE_SD and statistic <= _LITTLE_MOVED):
         return []
     return [
         f"the data say next to nothing: what is known best keeps {100 * min(least, 1.0):.0f} % of "

@@ -55,7 +55,7 @@ class Posterior(TableRepr):
     data: Data
 
     def summary_rows(self) -> tuple[str, list[tuple[str, str]]]:
-        """Return mean and sd of every unknown, the draws, and what is wrong with them."""
+        """Return mean and sd of every unknown, the number of draws, and the faults of the run."""
         table, sizes = self.summary(), self.tree["posterior"].sizes
         rows = [(name, f"{row['mean']:.4g} +- {row['sd']:.2g}") for name, row in table.items()]
         worst = max(row["r_hat"] for row in table.values())
@@ -297,10 +297,10 @@ def make_tree(
     else:
         posterior_key, prior_key = jax.random.split(rng_key)
         rows, some = predictions.spread(draws)
-        own = None if means is None else {n: np.asarray(m)[:, rows] for n, m in means.items()}
+        at_some = None if means is None else {n: np.asarray(m)[:, rows] for n, m in means.items()}
         prior = predictions.prior_replicates(model, prior_key)
         likelihood = predictions.log_likelihood(model, draws, data, means)
-        replicated = predictions.replicates(model, some, posterior_key, own)
+        replicated = predictions.replicates(model, some, posterior_key, at_some)
         replicated_prior = {name: values[None] for name, values in prior.data.items()}
         for group in (likelihood, replicated, replicated_prior):
             group |= {name: group[name][..., None] for name in single}

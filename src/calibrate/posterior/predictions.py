@@ -1,4 +1,4 @@
-r"""What a model predicts at draws: replicated data, and the log likelihood of each datum.
+r"""Predictions of a model at draws: replicated data, and the log likelihood of each datum.
 
 Replicates :math:`y^\text{rep} \sim p(y \mid \theta_s)` are drawn at draws of the posterior and of
 the prior. The log likelihood :math:`\log p(y_i \mid \theta_s)` of every datum at every draw is what
@@ -59,7 +59,7 @@ class Prior(NamedTuple):
 def log_likelihood(
     model: Model, draws: Draws, data: Mapping[str, Any], means: Draws | None = None
 ) -> dict[str, np.ndarray]:
-    """Log likelihood of each datum at each draw, (chains, draws, *shape), by observation.
+    """Return the log likelihood of each datum at each draw, (chains, draws, *shape), by name.
 
     Where noise correlates in space, given all other data of the observation. Data of a noise that
     has no density of a single one have one number a draw instead, (chains, draws).
@@ -103,12 +103,12 @@ def prior_replicates(model: Model, rng_key: jax.Array, count: int = REPLICATES) 
     return Prior(*({n: values[rows] for n, values in by.items()} for by in (draws, data)))
 
 
-def shortfall(found: int, asked: int = REPLICATES) -> list[str]:
-    """Return a sentence where the prior has ``found`` data sets and more were asked for."""
-    if found >= asked:
+def shortfall(count: int, asked: int = REPLICATES) -> list[str]:
+    """Return a sentence where the prior gives ``count`` data sets and more were asked for."""
+    if count >= asked:
         return []
     return [
-        f"the prior predicts {found} data sets in place of {asked}: the forward map has no answer "
+        f"the prior predicts {count} data sets in place of {asked}: the forward map has no answer "
         "at too many of its draws; give a narrower prior"
     ]
 
@@ -166,8 +166,8 @@ def _replicate(
     model: Model, draw: Data, means: Data | None, rng_key: jax.Array
 ) -> dict[str, jax.Array]:
     if means is not None:
-        own, *keys = jax.random.split(rng_key, len(means) + 1)
-        around = model.distributions(draw, model.fem_means(own, draw, means))
+        fem_key, *keys = jax.random.split(rng_key, len(means) + 1)
+        around = model.distributions(draw, model.fem_means(fem_key, draw, means))
         return {name: d.sample(k) for (name, d), k in zip(around.items(), keys, strict=True)}
     seeded = handlers.substitute(handlers.seed(model, rng_key), data=dict(draw))
     trace = handlers.trace(seeded).get_trace()
@@ -195,8 +195,8 @@ def _pointwise(distribution: Any, value: jax.Array) -> jax.Array:
         return distribution.log_conditionals(value)
     while isinstance(distribution, dist.Independent):
         distribution = distribution.base_dist
-    each = distribution.log_prob(value)
-    return each if each.shape == jnp.shape(value) else jnp.sum(each)
+    log_densities = distribution.log_prob(value)
+    return log_densities if log_densities.shape == jnp.shape(value) else jnp.sum(log_densities)
 
 
 def _flat(values: Draws | None) -> dict[str, jax.Array] | None:

@@ -116,14 +116,16 @@ def read_experiment(path: str | Path, entries: Mapping[str, Any] = {}) -> Proble
     common = {k: v for k, v in file.items() if k not in (MEMBERS, POPULATION)}
     problems = {}
     for name, table in tables.items():
-        own = {at[2:]: n for at, n in lines.items() if at[:2] == (MEMBERS, name) and at[2:]}
+        member_lines = {
+            at[2:]: n for at, n in lines.items() if at[:2] == (MEMBERS, name) and at[2:]
+        }
         where = f"{file_name}, member '{name}'"
-        problems[name] = problem({**common, **table}, {**lines, **own}, where)
-    own = {at[1:]: n for at, n in lines.items() if at[0] == POPULATION}
+        problems[name] = problem({**common, **table}, {**lines, **member_lines}, where)
+    population_lines = {at[1:]: n for at, n in lines.items() if at[0] == POPULATION}
     where = f"{file_name}, [population]"
-    shared = schema.read_as(Shared, file.get(POPULATION, {}), where, own, toml=True)
+    shared = schema.read_as(Shared, file.get(POPULATION, {}), where, population_lines, toml=True)
     with naming(file_name):
-        return Members({name: each.run for name, each in problems.items()}, shared, problems)
+        return Members({name: member.run for name, member in problems.items()}, shared, problems)
 
 
 def _without(table: Mapping[str, Any], entries: Mapping[str, Any]) -> dict[str, Any]:
@@ -138,7 +140,7 @@ def _without(table: Mapping[str, Any], entries: Mapping[str, Any]) -> dict[str, 
 
 
 def experiment_schema() -> dict[str, Any]:
-    """Return the schema (draft 2020-12). It admits what the reader admits of any scene and data."""
+    """Return the JSON Schema (draft 2020-12); it accepts the files that the reader accepts."""
     from calibrate.project.members import Members, Shared  # a room
 
     run: Any = _entries()
@@ -147,19 +149,19 @@ def experiment_schema() -> dict[str, Any]:
         MEMBERS: (dict[str, run], Field(None, description=about[MEMBERS])),
         POPULATION: (table_of(Shared), Field(None, description=about[POPULATION])),
     }
-    found = json_schema(create_model("ExperimentFile", __base__=run, **tables))
-    found["description"] = "What was measured on which body, and what is not known of it."
-    for table in found["$defs"].values():
+    file_schema = json_schema(create_model("ExperimentFile", __base__=run, **tables))
+    file_schema["description"] = "What was measured on which body, and what is not known of it."
+    for table in file_schema["$defs"].values():
         if "kernel" in table["properties"]:
             table["properties"]["kernel"]["enum"] = list(CORRELATIONS)
     # An entry that the file lacks for all members is required of each member.
-    found["$defs"][Run.__name__].pop("required")
+    file_schema["$defs"][Run.__name__].pop("required")
     whole: list[Any] = [{"dependentRequired": {POPULATION: [MEMBERS]}}]
-    for key in found.pop("required")[::-1]:
-        each = {MEMBERS: {"additionalProperties": {"required": [key]}}}
-        in_all = {"required": [MEMBERS], "properties": each}
+    for key in file_schema.pop("required")[::-1]:
+        members = {MEMBERS: {"additionalProperties": {"required": [key]}}}
+        in_all = {"required": [MEMBERS], "properties": members}
         whole.insert(0, {"anyOf": [{"required": [key]}, in_all]})
-    return {"title": "Experiment file", **found, "allOf": whole}
+    return {"title": "Experiment file", **file_schema, "allOf": whole}
 
 
 def _entries() -> type[Table]:

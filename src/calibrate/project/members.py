@@ -52,7 +52,7 @@ _SAME_MODEL = (
 
 @dataclass(frozen=True)
 class Shared:
-    """What members of a population have in common, as of :func:`calibrate.hierarchy`.
+    """The settings that all members of a population share, as in :func:`calibrate.hierarchy`.
 
     shared : unknowns that follow the population; by default all that every member has.
     median : median and relative sd of a log-normal prior of the population's median, by name.
@@ -132,13 +132,13 @@ def infer_members(
         posteriors: dict[str, Posterior] = {}
         verdicts: dict[str, str] = {}
         for name, run in plan.members.items():
-            own = folder / MEMBERS / name
-            posteriors[name] = _posterior_of(plan.problem(name), own, force, progress)
+            at = folder / MEMBERS / name
+            posteriors[name] = _posterior_of(plan.problem(name), at, force, progress)
             if certify:
                 verdicts[name] = (
-                    _written_verdict(own)
+                    _written_verdict(at)
                     or certify_and_keep(
-                        posteriors[name], own, load_steps=run.load_steps, progress=progress
+                        posteriors[name], at, load_steps=run.load_steps, progress=progress
                     ).verdict
                 )
         hierarchy = _sample_together(plan, posteriors, folder / SAMPLING, progress=progress)
@@ -190,7 +190,7 @@ def verdicts_in(plan: Members, folder: str | Path) -> dict[str, str]:
 
 
 def _posterior_of(problem: Problem, folder: Path, force: bool, progress: bool) -> Posterior:
-    """Return a member's own posterior: the one in ``folder`` if it is of this problem."""
+    """Return the posterior of one member: the one in ``folder`` if it is of this problem."""
     if (folder / POSTERIOR).exists() and not force:
         run, posterior = read_posterior(folder)
         if run == problem.run and is_of(posterior, with_data(problem)):

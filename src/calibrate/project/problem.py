@@ -1,4 +1,4 @@
-r"""The inverse problem of a run: its scene, what is observed, its data, and the model of them.
+r"""The inverse problem of a run: its scene, observations, data, and their statistical model.
 
 :func:`read_problem` builds the scene and parses the data file, :func:`with_data` makes synthetic
 data by FEM, and :func:`build_model` returns the model
@@ -49,7 +49,7 @@ def simulator_of(scene: Scene, load_steps: int = 1) -> Simulator:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A run, and what its words name. :func:`read_problem` makes it.
+    """A run, and the objects that its words name. :func:`read_problem` makes it.
 
     run : the run, with every noise by the observation's name, and with the parameters that its
         data files know.
@@ -164,14 +164,14 @@ def with_data(problem: Problem) -> Problem:
 
 
 def make_data(run: Run, scene: Scene) -> tuple[Observations, dict[str, np.ndarray]]:
-    """Return the observations and the data of a run, in ``scene`` instead of the run's own."""
+    """Return the observations and the data of a run, with ``scene`` in place of the run's."""
     problem = with_data(read_problem(run, scene=scene))
     assert problem.data is not None
     return problem.observe, dict(problem.data)
 
 
 def ingredients(run: Run, scene: Scene, *, progress: bool = False) -> Ingredients:
-    """Return what the forward map of a run is made of."""
+    """Return the ingredients of the forward map of a run."""
     simulator = simulator_of(scene, run.load_steps)
     return Ingredients(scene, simulator, run.emulator, run.seed, progress=progress)
 
@@ -205,7 +205,7 @@ def model_before_data(run: Run | Problem, *, progress: bool = False) -> Model:
         return run_model
     # Some of these errors depend on the deformed body, which is taken at a draw of the prior.
     draws = run_model.prior_draws(jax.random.key(run.seed), 1)
-    predicted, _ = run_model.predict({name: each[0] for name, each in draws.items()})
+    predicted, _ = run_model.predict({name: values[0] for name, values in draws.items()})
     means = {name: np.asarray(mean) for name, mean in predicted.items()}
     return with_described_errors(run_model, means, run.systematic)[0]
 

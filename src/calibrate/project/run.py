@@ -1,4 +1,4 @@
-"""The one description of a calibration: what to calibrate, and how.
+"""The one description of a calibration: scene, data, model, and sampler.
 
 A :class:`Run` is an experiment file, ``run.json``, and what the command line's options say. Its
 fields are the keys of both files and the names of the options; its docstring describes the keys in
@@ -34,7 +34,7 @@ SYNTHETIC = "synthetic"
 
 @dataclass(frozen=True)
 class Run:
-    """What to calibrate and how.
+    """The description of a calibration.
 
     scene : a scene's name or file.
     root : the folder of the published data.
@@ -174,8 +174,8 @@ class Run:
     def synthetic_noise(self, observe: Observations) -> dict[str, Noise]:
         """Return the noise of each observation of synthetic data."""
         noises = replace(self, noise_scale={}).noises(observe)
-        each = {name: noise for name, (_, noise) in observe.expand(noises, "noise").items()}
-        return at_sites(each, observe)
+        by_name = {name: noise for name, (_, noise) in observe.expand(noises, "noise").items()}
+        return at_sites(by_name, observe)
 
 
 def _by_name[T](
@@ -195,7 +195,7 @@ def _by_name[T](
 
 
 def with_absolute_paths(entries: Mapping[str, Any], folder: Path = Path()) -> dict[str, Any]:
-    """Return entries of a run that mean the same in every folder.
+    """Return the entries of a run with absolute paths, so that they hold in every folder.
 
     Files and folders become absolute; names of built-in scenes and shipped emulators stay. A file
     of a prior becomes its content: a run must not change with the file.

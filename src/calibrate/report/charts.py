@@ -51,7 +51,7 @@ def names_with_units(posterior: Posterior) -> dict[str, str]:
 
 
 def against_data(posterior: Posterior) -> Iterator[tuple[str, go.Figure]]:
-    """Yield a chart for each observation: the data against what the posterior predicts."""
+    """Yield a chart for each observation: the data against the posterior predictions."""
     tree = posterior.tree
     if "posterior_predictive" not in tree.children:
         return
@@ -105,15 +105,15 @@ def _curves(part: Observation, values: np.ndarray, data: np.ndarray) -> go.Figur
     """Return each curve of an observation: data, and the 90 % band of predictions."""
     low, high = np.nanquantile(values, [0.05, 0.95], axis=0)
     figure = go.Figure()
-    for k, (label, (x, own)) in enumerate(part.curves.items()):
+    for k, (label, (x, rows)) in enumerate(part.curves.items()):
         colour = COLOURS[k % len(COLOURS)]
         figure.add_scatter(
-            x=[*x, *x[::-1]], y=[*high[own], *low[own][::-1]], fill="toself", line_width=0,
+            x=[*x, *x[::-1]], y=[*high[rows], *low[rows][::-1]], fill="toself", line_width=0,
             fillcolor=translucent(colour, 0.25), hoverinfo="skip", showlegend=False,
             mode="lines",
         )  # fmt: skip
         figure.add_scatter(
-            x=x, y=data[own], mode="markers", marker={"color": colour, "size": 6}, name=label
+            x=x, y=data[rows], mode="markers", marker={"color": colour, "size": 6}, name=label
         )
     share = 100.0 * inside(values, data).mean()
     figure.update_layout(
@@ -228,7 +228,7 @@ def volume_band(posterior: Posterior) -> go.Figure | None:
     )  # fmt: skip
     figure.add_scatter(
         x=middle, y=p, mode="lines", line_color=BLUE, name="median",
-        text=[in_mmhg(each) for each in p], hovertemplate="%{x:.1f} mL at %{text}",
+        text=[in_mmhg(pressure) for pressure in p], hovertemplate="%{x:.1f} mL at %{text}",
     )  # fmt: skip
     figure.add_scatter(
         x=[curve.rest, middle[0]], y=[0.0, p[0]], line={"color": BLUE, "dash": "dot"},
@@ -296,5 +296,5 @@ def _add_klotz(
     figure.add_scatter(
         x=np.asarray(klotz.volume(p)), y=p, mode="lines", line={"color": "gray", "dash": "dash"},
         name=f"left ventricles (Klotz et al. 2006), through the {through} at {in_mmhg(pressure)}",
-        text=[in_mmhg(each) for each in p], hovertemplate="%{x:.1f} mL at %{text}",
+        text=[in_mmhg(kpa) for kpa in p], hovertemplate="%{x:.1f} mL at %{text}",
     )  # fmt: skip

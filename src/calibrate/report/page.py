@@ -1,4 +1,4 @@
-"""The page of a posterior: verdict, data, parameters, body, what is known, how to repeat it."""
+"""The page of a posterior: verdict, data, parameters, body, known combinations, settings."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def _verdict(
 
 
 def _basis(certificate: dict[str, Any]) -> Iterator[str]:
-    """Yield the sentences that say what a verdict rests on, and its limits."""
+    """Yield sentences on the evidence behind a verdict, and on its limits."""
     mesh = certificate.get("mesh") or {}
     where = "between the grips" if mesh.get("gripped") else "on a finer mesh"
     runs = f"Judged by {certificate['draws']} FEM runs, {certificate['failed']} failed"
@@ -168,48 +168,48 @@ def _known(posterior: Posterior) -> list[Markup]:
 
 
 def _sheet(posterior: Posterior) -> list[Markup]:
-    """Return what forces tell of a sheet: its moduli times its thickness, which was assumed."""
+    """Return the product of moduli and assumed thickness that forces on a sheet determine."""
     model, scene = posterior.model, posterior.model.forward.scene
     thickness, width, _ = np.sort(np.ptp(scene.mesh.nodes, axis=0))
     forces = any(part.unit == "N" for part in model.observe.parts.values())
     if not forces or thickness > _SHEET * width:
         return []
     draws, moduli = posterior.draws(), (*scene.law.shape_moduli, "prestress")
-    told = [name for name in moduli if name in draws]
+    names = [name for name in moduli if name in draws]
     rows = [
-        (name, parts.median_and_range(thickness * np.ravel(draws[name]), ".3g")) for name in told
+        (name, parts.median_and_range(thickness * np.ravel(draws[name]), ".3g")) for name in names
     ]
     text = (
         f"The body is a sheet, {thickness:.3g} mm thick. Forces on a sheet are in proportion to "
         "moduli times thickness, so moduli err as the thickness does. Of the product they tell:"
     )
     head = ("modulus", "times the thickness (N/m), median and 90 %")
-    return [parts.paragraph(text), parts.table(head, rows)] if told else []
+    return [parts.paragraph(text), parts.table(head, rows)] if names else []
 
 
 def _terms(posterior: Posterior) -> list[Markup]:
-    """Return which terms a specimen's law needs, where its data are linear in the moduli."""
+    """Return the terms that a specimen's law needs, where its data are linear in the moduli."""
     if not is_specimen(posterior.model.forward.scene):
         return []
     try:
-        found = find_terms(posterior.model, posterior.data)
+        terms = find_terms(posterior.model, posterior.data)
     except InputError:
         return []
     head = ("term", "probability", "modulus where it is there (kPa)")
     rows = [
-        (name, f"{probability:.3f}", "{:.3g} +- {:.2g}".format(*found.moduli[name]))
-        if name in found.moduli
+        (name, f"{probability:.3f}", "{:.3g} +- {:.2g}".format(*terms.moduli[name]))
+        if name in terms.moduli
         else (name, f"{probability:.3f}", "not seen")
-        for name, probability in sorted(found.probabilities.items(), key=lambda item: -item[1])
+        for name, probability in sorted(terms.probabilities.items(), key=lambda item: -item[1])
     ]
-    told = "Which terms of the law do the data show? All sets of up to five, by their evidence."
-    if found.undecided:
-        told += f" The data do not tell of {', '.join(found.undecided)}."
-    blocks = [parts.paragraph(told), parts.table(head, rows)]
-    if found.held_out:
-        told = f"Each test left out in turn: {found.held_out_in_words()}."
-        tests = parts.table(HeldOut.head, (each.cells for each in found.held_out))
-        blocks += [parts.paragraph(told), tests]
+    text = "Which terms of the law do the data show? All sets of up to five, by their evidence."
+    if terms.undecided:
+        text += f" The data do not tell of {', '.join(terms.undecided)}."
+    blocks = [parts.paragraph(text), parts.table(head, rows)]
+    if terms.held_out:
+        text = f"Each test left out in turn: {terms.held_out_in_words()}."
+        tests = parts.table(HeldOut.head, (test.cells for test in terms.held_out))
+        blocks += [parts.paragraph(text), tests]
     return blocks
 
 

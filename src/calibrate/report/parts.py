@@ -1,4 +1,4 @@
-"""The blocks that pages are made of, and the template that renders them (``page.html.j2``)."""
+"""The blocks of pages, and the template that renders them (``page.html.j2``)."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def summary_cells(row: Mapping[str, float]) -> list[str]:
 
 def median_and_range(values: np.ndarray, form: str = ".1f") -> str:
     """Return median and central 90 % of draws (s,), each number in the format ``form``."""
-    low, middle, high = (format(each, form) for each in np.quantile(values, [0.05, 0.5, 0.95]))
+    low, middle, high = (format(number, form) for number in np.quantile(values, [0.05, 0.5, 0.95]))
     return f"{middle} ({low} to {high})"
 
 

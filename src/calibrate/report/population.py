@@ -153,7 +153,7 @@ def _verdict(verdicts: Mapping[str, str], warnings: Sequence[str]) -> Verdict:
     if len(distinct) == 1:
         text = f"all members: {distinct[0]}"
     findings = [
-        f"{verdict}: {', '.join(name for name, own in verdicts.items() if own == verdict)}"
+        f"{verdict}: {', '.join(name for name, answer in verdicts.items() if answer == verdict)}"
         for verdict in distinct
         if parts.colour_of(verdict) != parts.GOOD
     ]
@@ -206,7 +206,7 @@ def _members(
             f"calibrate report on {MEMBERS}/NAME in this folder, then on the folder again."
         ),
         parts.table(("", "FEM says", "data within 90 %", "page"), checks),
-        *(parts.paragraph(each, "warning") for each in misfit_sentences),
+        *(parts.paragraph(sentence, "warning") for sentence in misfit_sentences),
     ]
 
 

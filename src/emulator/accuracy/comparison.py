@@ -100,11 +100,11 @@ def field_errors(
         volumes = [_percent(V(u[V.nodes]), V(reference[V.nodes])) for V in cavities]
         errors["err_V"] = jnp.stack(volumes)
     if supports:
-        found, exact = (
+        resultants, exact = (
             jnp.stack([R(v[R.nodes], theta) / MN_PER_N for R in supports]) for v in (u, reference)
         )
-        found = found if forces is None else forces
-        errors |= {"err_R": jnp.abs(found - exact), "max_R": jnp.max(jnp.abs(exact))}
+        resultants = resultants if forces is None else forces
+        errors |= {"err_R": jnp.abs(resultants - exact), "max_R": jnp.max(jnp.abs(exact))}
     return errors
 
 
@@ -146,7 +146,7 @@ def case_errors(forward: ForwardMap, thetas: jax.Array, reference: jax.Array) ->
     # The forces of a mesh that is the loaded one need displacements from rest, too.
     supports = () if scene.loaded_by else tuple(support_forces(scene).values())
     by_work = getattr(forward, "support_force", lambda _: None)
-    told = [by_work(support) for support in supports]
+    work_forces = [by_work(support) for support in supports]
 
     @jax.jit
     def one(theta: jax.Array, exact: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
@@ -154,7 +154,7 @@ def case_errors(forward: ForwardMap, thetas: jax.Array, reference: jax.Array) ->
         u = prediction.displacement
         forces = [
             (R(u[R.nodes], theta) if known is None else known(theta)) / MN_PER_N
-            for R, known in zip(supports, told, strict=True)
+            for R, known in zip(supports, work_forces, strict=True)
         ]
         stacked = jnp.stack(forces) if forces else None
         errors = field_errors(scene, theta, u, exact, cavities, supports, stacked)

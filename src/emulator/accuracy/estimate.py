@@ -135,10 +135,11 @@ def guard(scene: Scene, theta: jax.Array, u: jax.Array) -> Guard:
     active = jnp.any(limits.J_start > J) | jnp.any(limits.I1_start < I1)
     no = jnp.array(False)
     # Each entry of theta with all others at the centre of the box; NaN is outside.
-    each = jnp.where(jnp.eye(len(scene.parameters), dtype=bool), theta[None, :], scene.centre)
+    alone = jnp.eye(len(scene.parameters), dtype=bool)
+    single_changes = jnp.where(alone, theta[None, :], scene.centre)
     return Guard(
         theta=theta,
-        outside=~scene.space.contains(each),
+        outside=~scene.space.contains(single_changes),
         finite=finite,
         least_J=jnp.min(J),
         barrier=active | jnp.any(I4f > limits.I4f_start),

@@ -108,14 +108,14 @@ def read_cells(path: Path, *, unloading: bool = False) -> Cells:
 
 
 def _check_marks(path: Path, rows: Mapping[int, Mapping[str, str]], *, decimal_comma: bool) -> None:
-    """Refuse numbers with a comma beside others with a point: one may be of thousands."""
+    """Raise InputError where some numbers have a comma and others a point: one may be thousands."""
     if not decimal_comma:
         return
     first: dict[str, tuple[int, str, str]] = {}
     for number, row in rows.items():
         for word, cell in row.items():
-            if (found := _MARKED.fullmatch(cell)) is not None:
-                first.setdefault(found[1], (number, word, cell))
+            if (mark := _MARKED.fullmatch(cell)) is not None:
+                first.setdefault(mark[1], (number, word, cell))
     if len(first) == 2:
         (a, in_a, one), (b, in_b, other) = first.values()
         raise InputError(
@@ -167,13 +167,13 @@ def _of_sheets(path: Path) -> Raw:
         raise InputError(f"data file {path} is not a readable spreadsheet: {error}") from error
     sheets = {title: rows for title, rows in sheets.items() if len(rows) > 1}
     words = list(dict.fromkeys(word for rows in sheets.values() for word in rows[0] if word))
-    own = len(sheets) > 1 and PROTOCOL not in words
+    several_sheets = len(sheets) > 1 and PROTOCOL not in words
     cells = []
     for title, (header, *rows) in sheets.items():
         for row in rows:
             by_word = dict(zip(header, row, strict=False))
-            cells.append([by_word.get(word, "") for word in words] + [title] * own)
-    return words + [PROTOCOL] * own, cells, False
+            cells.append([by_word.get(word, "") for word in words] + [title] * several_sheets)
+    return words + [PROTOCOL] * several_sheets, cells, False
 
 
 def _texts(rows: Iterator[tuple[Any, ...]]) -> Iterator[list[str]]:

@@ -1,4 +1,4 @@
-"""What a person sees of work and of results: bars of progress, and tables for ``repr``.
+"""Progress bars of long computations, and tables for the ``repr`` of results.
 
 A bar is drawn over itself on a terminal. Elsewhere a line is written now and then: a log file would
 keep every one of a bar's states.

@@ -37,8 +37,8 @@ def check_known(name: object, known: Iterable[str], noun: str) -> None:
 
 def check_arguments(options: Iterable[str], what: str, *functions: Callable[..., Any]) -> None:
     """Raise :class:`InputError`, about ``what``, for an option that no function takes by name."""
-    parameters = [each for f in functions for each in signature(f).parameters.values()]
-    known = dict.fromkeys(each.name for each in parameters if each.kind is each.KEYWORD_ONLY)
+    parameters = [p for f in functions for p in signature(f).parameters.values()]
+    known = dict.fromkeys(p.name for p in parameters if p.kind is p.KEYWORD_ONLY)
     for option in options:
         check_known(option, known, f"{what}: option")
 

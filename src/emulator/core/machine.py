@@ -1,4 +1,4 @@
-"""What this process may use of its machine, and the project's one global switch: JAX in float64.
+"""The cores and memory that this process may use, and the one global switch: JAX in float64.
 
 Sparse factorisation, Newton's method and likelihoods need float64, and the sparse solvers accept
 nothing else. Importing :mod:`emulator` turns it on, once, here. Networks ask for float32

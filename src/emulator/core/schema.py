@@ -252,13 +252,13 @@ def describe(value: Any) -> dict[str, Any]:
     Fields with ``compare=False`` are left out: the program sets them, not a file.
     """
     kind = {"kind": value.kind} if hasattr(value, "kind") else {}
-    return kind | {each.name: getattr(value, each.name) for each in fields(value) if each.compare}
+    return kind | {f.name: getattr(value, f.name) for f in fields(value) if f.compare}
 
 
 def restore[Kind](
     kinds: Mapping[str, type[Kind]], description: Mapping[str, Any], noun: str
 ) -> Kind:
-    """Return the dataclass that :func:`describe` described.
+    """Return the dataclass from the plain data of :func:`describe`.
 
     kinds : the registry, from ``kind`` to dataclass.
     description : plain data, of which ``kind`` names the class and all else are its fields.
@@ -279,7 +279,7 @@ def table_of(kind: type, key: str = "", tag: str = "") -> type[Table]:
     """
     hints = get_type_hints(kind)
     entries: dict[str, Any] = {key: (Literal[tag], tag)} if key else {}
-    for entry in (each for each in fields(kind) if each.compare):
+    for entry in (f for f in fields(kind) if f.compare):
         required = entry.default is MISSING and entry.default_factory is MISSING
         # np.ndarray stands for a vector in a file. Defaults are left to the dataclass, and shown.
         hint = tuple[float, float, float] if hints[entry.name] is np.ndarray else hints[entry.name]
@@ -305,7 +305,7 @@ def json_schema(model: type[Table]) -> dict[str, Any]:
 def _for_files(node: Any) -> Any:
     """Return a schema without null, which no file has, and without titles made of keys."""
     if isinstance(node, list):
-        return [_for_files(each) for each in node if each != {"type": "null"}]
+        return [_for_files(entry) for entry in node if entry != {"type": "null"}]
     if not isinstance(node, dict):
         return node
     empty = {"default": None, "title": node.get("title")}

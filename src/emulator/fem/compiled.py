@@ -40,12 +40,12 @@ def compiled[**P, R](function: Callable[P, R]) -> Callable[P, R]:
     so the decorator serves methods too. All other arguments are trees of arrays. Python's numbers
     are taken as arrays, so that 1.0 and an array share a program.
     """
-    own: dict[Any, Callable[..., Any]] = {}
+    unbound_programs: dict[Any, Callable[..., Any]] = {}
 
     @wraps(function)
     def run(*arguments: Any, **named: Any) -> R:
         call: Callable[..., R] = function
-        programs, rest = own, arguments
+        programs, rest = unbound_programs, arguments
         if rest and hasattr(rest[0], "programs"):
             call, programs = partial(function, rest[0]), rest[0].programs
             rest = rest[1:]
@@ -84,7 +84,7 @@ class _Program:
 
         evaluate.__name__ = name
         # Without unused arguments the texts of two bodies could agree where their shapes do not.
-        self.own: Any = jax.jit(evaluate, keep_unused=True)
+        self.program: Any = jax.jit(evaluate, keep_unused=True)
         self.shared: Any = None
         self.arrays = traced.consts
         self.inside = is_traced(self.arrays)  # whether this is part of a larger trace
@@ -94,10 +94,10 @@ class _Program:
 
     def __call__(self, leaves: list[jax.Array]) -> Any:
         if self.inside or any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
-            return self.own(self.arrays, leaves)
+            return self.program(self.arrays, leaves)
         if self.shared is None:
-            text = self.own.lower(self.arrays, leaves).as_text()
-            self.shared = PROGRAMS.same_as(text, self.own)
+            text = self.program.lower(self.arrays, leaves).as_text()
+            self.shared = PROGRAMS.same_as(text, self.program)
         return self.shared(self.arrays, leaves)
 
 

@@ -60,8 +60,8 @@ def _means(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, jax.Array]
     P = _first_piola(scene, H, theta)
     values = scene.resolve(theta)
     fibres = None if scene.fibres is None else scene.fibres_at(theta)
-    given = (load.first_piola(F, scene.mesh, fibres, values) for load in scene.loads)
-    P = sum((stress for stress in given if stress is not None), P)
+    load_stresses = (load.first_piola(F, scene.mesh, fibres, values) for load in scene.loads)
+    P = sum((stress for stress in load_stresses if stress is not None), P)
     # Round-off leaves sigma slightly asymmetric; eigenvalue routines need it symmetric.
     sigma = _symmetric(P @ jnp.swapaxes(F, -1, -2)) / J[..., None, None]
     fields = {

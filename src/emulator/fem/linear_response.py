@@ -102,8 +102,8 @@ def _stiffnesses(grid: Discretisation, fibres: np.ndarray) -> tuple[np.ndarray, 
     def products(vectors: np.ndarray) -> np.ndarray:
         """Return the integrals of ``vectors`` (m, q, a, 3) times themselves."""
         flat = vectors.reshape(count, points, -1)
-        each = np.swapaxes(flat * weights[..., None], 1, 2) @ flat
-        return each.reshape(count, nodes, 3, nodes, 3)
+        blocks = np.swapaxes(flat * weights[..., None], 1, 2) @ flat
+        return blocks.reshape(count, nodes, 3, nodes, 3)
 
     bulk = products(gradients)
     trace = np.einsum("maibi->mab", bulk)

@@ -53,7 +53,7 @@ class LoadedEquilibrium:
 
     @cached_property
     def _on_mesh(self) -> Scene:
-        """The scene as if its mesh were at rest.
+        """The scene with its mesh taken as stress-free.
 
         A parameter that only the image has is then nobody's, which a new scene would refuse.
         """
@@ -61,12 +61,12 @@ class LoadedEquilibrium:
 
     @cached_property
     def unloader(self) -> Unloader:
-        """What finds the stress-free shape."""
+        """The solver of the inverse problem, which returns the stress-free shape."""
         return Unloader(self._on_mesh, options=self.options)
 
     @cached_property
     def system(self) -> System:
-        """The equations on the mesh, whose pattern those at rest have."""
+        """The equations on the mesh; equations at rest have this sparsity pattern."""
         return System(self._on_mesh)
 
     def solve(self, theta: jax.Array, start: jax.Array | None) -> Solution:
@@ -111,8 +111,8 @@ class LoadedEquilibrium:
         image_slopes = jax.jacfwd(partial(image_theta, self.scene))(theta)
         by_image = self.unloader.sensitivities(unloaded, image)
         w, w_slopes = unloaded.displacement, jnp.tensordot(image_slopes.T, by_image, 1)
-        each = jnp.eye(len(theta))
-        return w_slopes + _derivatives_along(self.system, v - w, theta, w, each, w_slopes)
+        directions = jnp.eye(len(theta))
+        return w_slopes + _derivatives_along(self.system, v - w, theta, w, directions, w_slopes)
 
     def equations(self, v: jax.Array, theta: jax.Array) -> tuple[Equations, ...]:
         """Return the equations of w and of u, at ``v`` (n, 3) mm from the mesh."""

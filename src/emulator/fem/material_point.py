@@ -60,43 +60,43 @@ class MaterialPoint:
         return self.measures.energy(lambda strain: law.energy(strain, *parameters), at.directions)
 
     def linearise(
-        self, H: jax.Array, own: jax.Array, at: Tissue, geometric: jax.Array | float = 1.0
+        self, H: jax.Array, xi: jax.Array, at: Tissue, geometric: jax.Array | float = 1.0
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Return stress P (3, 3), moduli (3, 3, 3, 3) and known stress (3, 3) in kPa.
 
         H : the displacement gradient, (3, 3).
-        own : the measures (k,) that the point's stresses belong to.
+        xi : the measures (k,) that the point's stresses belong to.
         at : the tissue.
         geometric : the fraction of the stresses' change since rest whose geometric stiffness the
             moduli have: the known stress is that at rest and this fraction of the change.
         """
         phi = self.energy(at)
 
-        def stresses(own: jax.Array) -> tuple[jax.Array, jax.Array]:
-            s = jax.grad(phi)(own)
+        def stresses(xi: jax.Array) -> tuple[jax.Array, jax.Array]:
+            s = jax.grad(phi)(xi)
             return s, s
 
         # Derivatives that return their values as well save one trace.
-        C, s = jax.jacfwd(stresses, has_aux=True)(own)
-        at_rest = jax.grad(phi)(jnp.zeros_like(own))
+        C, s = jax.jacfwd(stresses, has_aux=True)(xi)
+        at_rest = jax.grad(phi)(jnp.zeros_like(xi))
         known = at_rest + geometric * (s - at_rest)
         now = self.measures.of(H, at.directions)
         slope, curvature = self.measures.derivatives(H, at.directions, known)
-        stress = jnp.tensordot(s + C @ (now - own), slope, 1)
+        stress = jnp.tensordot(s + C @ (now - xi), slope, 1)
         tangent = jnp.einsum("kij,kl,lab->ijab", slope, C, slope) + curvature
         return stress, tangent, jnp.tensordot(known, slope, 1)
 
-    def at_stress(self, H: jax.Array, change: jax.Array, own: jax.Array, at: Tissue) -> jax.Array:
+    def at_stress(self, H: jax.Array, change: jax.Array, xi: jax.Array, at: Tissue) -> jax.Array:
         """Return the measures (k,) at which the law has the stress that the step predicts.
 
         H, change : the displacement gradient (3, 3) and its change in the step.
-        own : the measures before it.
+        xi : the measures before the step.
         """
         phi = self.energy(at)
-        xi, along = jax.jvp(lambda H: self.measures.of(H, at.directions), (H,), (change,))
-        step, blocks = xi + along - own, jnp.asarray(self.measures.blocks)
-        parts = fractions_at_stress(len(blocks), lambda beta: phi(own + (beta @ blocks) * step))
-        return own + (parts @ blocks) * step
+        now, along = jax.jvp(lambda H: self.measures.of(H, at.directions), (H,), (change,))
+        step, blocks = now + along - xi, jnp.asarray(self.measures.blocks)
+        parts = fractions_at_stress(len(blocks), lambda beta: phi(xi + (beta @ blocks) * step))
+        return xi + (parts @ blocks) * step
 
 
 def fractions_at_stress(count: int, energy: Callable[[jax.Array], jax.Array]) -> jax.Array:

@@ -205,11 +205,11 @@ class SupportForce:
 
 def support_forces(scene: Scene) -> dict[str, SupportForce]:
     """Return the force of each support along each axis that it holds, by ``SUPPORT:AXIS``."""
-    held = [each for support in scene.supports if (each := support.held(scene.mesh)) is not None]
     return {
-        f"{each.where}:{'xyz'[k]}": SupportForce(scene, each.where, tuple(np.eye(3)[k].tolist()))
-        for each in held
-        for k in each.axes
+        f"{held.where}:{'xyz'[k]}": SupportForce(scene, held.where, tuple(np.eye(3)[k].tolist()))
+        for support in scene.supports
+        if (held := support.held(scene.mesh)) is not None
+        for k in held.axes
     }
 
 

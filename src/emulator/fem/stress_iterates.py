@@ -152,8 +152,8 @@ class StressIterates:
 def _measures_of(system: System, u: jax.Array, theta: jax.Array) -> jax.Array:
     """Return the strain measures (b, q, k) of the displacement ``u`` (n, 3) mm."""
     scene, measures = system.scene, MaterialPoint(system.scene, theta).measures
-    own = lambda H, at: measures.of(H, at.directions)  # noqa: E731
-    return at_points(own, law_gradients(scene, u), scene.block_tissue_at(theta))
+    measures_at = lambda H, at: measures.of(H, at.directions)  # noqa: E731
+    return at_points(measures_at, law_gradients(scene, u), scene.block_tissue_at(theta))
 
 
 @compiled
@@ -169,8 +169,8 @@ def _equations(
     """Return the equations of a step."""
     scene, point = system.scene, MaterialPoint(system.scene, theta)
 
-    def linearise(H: jax.Array, own: jax.Array, at: Tissue) -> tuple[jax.Array, ...]:
-        return point.linearise(H, own, at, geometric)
+    def linearise(H: jax.Array, xi: jax.Array, at: Tissue) -> tuple[jax.Array, ...]:
+        return point.linearise(H, xi, at, geometric)
 
     tissue = scene.block_tissue_at(theta)
     stress, moduli, known = at_points(linearise, law_gradients(scene, u), measures, tissue)
@@ -198,7 +198,7 @@ def _advanced(
 
 
 def applies(scene: Scene) -> bool:
-    """Return whether stresses can be unknowns of a scene, and whether that pays.
+    """Return whether stresses can be unknowns of a scene, and whether that saves time.
 
     Its law must be exponential and read nothing but measures.
     """

@@ -83,7 +83,7 @@ def from_nodes(mesh: Mesh, at_nodes: np.ndarray, order: int) -> np.ndarray:
 
 
 def from_elements(mesh: Mesh, directions: np.ndarray) -> np.ndarray:
-    """Return unit directions (m, 4, 3) at the points of quadratic elements from one each, (m, 3).
+    """Interpolate one direction per element, (m, 3), at quadratic elements' points, (m, 4, 3).
 
     ``mesh`` is quadratic, or linear and about to be.
     """
@@ -100,8 +100,8 @@ def from_elements(mesh: Mesh, directions: np.ndarray) -> np.ndarray:
     change = side[:, None] * directions[other] - directions[one]
     of_row = csr_matrix((np.ones(len(one)), (one, np.arange(len(one)))), (count, len(one)))
     gram, moment = (
-        (of_row @ (weight * step[:, :, None] * each[:, None]).reshape(-1, 9)).reshape(-1, 3, 3)
-        for each in (step, change)
+        (of_row @ (weight * step[:, :, None] * x[:, None]).reshape(-1, 9)).reshape(-1, 3, 3)
+        for x in (step, change)
     )
     damping = _DAMPING * np.maximum(np.trace(gram, axis1=1, axis2=2), 1e-300)
     gram = gram + damping[:, None, None] * np.eye(3)

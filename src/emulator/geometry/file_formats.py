@@ -52,7 +52,7 @@ def read_cells(path: Path) -> meshio.Mesh:
 
 
 def _read(path: Path) -> meshio.Mesh:
-    """Return what the first of meshio's readers for the suffix makes of a file.
+    """Read a file by the first of meshio's readers for its suffix that accepts it.
 
     meshio.read prints why its readers refuse a file, and exits; standard output could only be
     caught for all threads.
@@ -69,7 +69,7 @@ def _read(path: Path) -> meshio.Mesh:
 
 
 def _reader(path: Path) -> Callable[[Path], meshio.Mesh]:
-    """Return what reads the file, by its suffix and its first bytes."""
+    """Return the reader of the file, by its suffix and its first bytes."""
     with path.open("rb") as file:
         head = file.read(1000)
     suffix = path.suffix.lower()
@@ -77,21 +77,21 @@ def _reader(path: Path) -> Callable[[Path], meshio.Mesh]:
         raise InputError("it has Gmsh's format 1, not 2 or 4; gmsh -save -format msh41 converts it")
     if suffix == ".vtk" and re.search(rb"DATASET\s+POLYDATA", head):
         return _read_polydata
-    own = {".msh": _read_gmsh, ".inp": _read_abaqus, ".vtp": _read_vtp}
-    return own.get(suffix, _read)
+    readers = {".msh": _read_gmsh, ".inp": _read_abaqus, ".vtp": _read_vtp}
+    return readers.get(suffix, _read)
 
 
 def _unsigned(original: Callable[..., Any], *arguments: Any) -> Any:
-    """Return entities as meshio's reader of Gmsh's format 4, their tags without sign, 0 for none.
+    """Read entities of Gmsh's format 4 by meshio, with tags without sign, and 0 for no group.
 
-    A negative tag says that an entity stands reversed in its group. Of an entity in no group meshio
-    would drop the tags, and take the others for those of other cells.
+    A negative tag says that an entity is reversed in its group. meshio drops the tag of an entity
+    in no group, and then assigns the remaining tags to the wrong cells.
     """
-    found = original(*arguments)
-    for of_entities in found[0] if isinstance(found[0], tuple) else found:
+    entities = original(*arguments)
+    for of_entities in entities[0] if isinstance(entities[0], tuple) else entities:
         for entity, tags in of_entities.items():
             of_entities[entity] = [abs(int(tag)) for tag in tags] or [0]
-    return found
+    return entities
 
 
 for _module in (_gmsh40, _gmsh41):
@@ -101,10 +101,10 @@ for _module in (_gmsh40, _gmsh41):
 def _read_gmsh(path: Path) -> meshio.Mesh:
     """Return a Gmsh file. In format 2, ``Mesh.SaveAll = 1`` leaves only the names of groups."""
     content = _read(path)
-    tags = [np.abs(each) for each in content.cell_data.get("gmsh:physical", [])]
+    tags = [np.abs(numbers) for numbers in content.cell_data.get("gmsh:physical", [])]
     if tags:
         content.cell_data["gmsh:physical"] = tags
-    if content.field_data and not any(each.any() for each in tags):
+    if content.field_data and not any(numbers.any() for numbers in tags):
         names = ", ".join(content.field_data)
         content.info = [f"groups {names}, which are empty (save them with Mesh.SaveAll = 0)"]
     return content
@@ -134,23 +134,23 @@ def _read_polydata(path: Path) -> meshio.Mesh:
     """Return the polygons of VTK's PolyData in a legacy file, which comes without its data."""
     text = re.sub(rb"DATASET\s+POLYDATA", b"DATASET UNSTRUCTURED_GRID", path.read_bytes(), count=1)
     text = re.split(rb"\n(?:POINT|CELL)_DATA\s+\d+\s*\n", text, maxsplit=1)[0]
-    found = re.search(rb"\nPOLYGONS\s+(\d+)", text)
-    if found is None or re.search(rb"\n(VERTICES|LINES|TRIANGLE_STRIPS)\s+\d", text):
+    polygons = re.search(rb"\nPOLYGONS\s+(\d+)", text)
+    if polygons is None or re.search(rb"\n(VERTICES|LINES|TRIANGLE_STRIPS)\s+\d", text):
         raise InputError("it has no polygons, or also points, lines or strips; keep the triangles")
     text = text.replace(b"\nPOLYGONS", b"\nCELLS", 1)
-    count = int(found[1]) - text.splitlines()[0].strip().endswith(b"5.1")  # there, of offsets
+    count = int(polygons[1]) - text.splitlines()[0].strip().endswith(b"5.1")  # there, of offsets
     binary = text.splitlines()[2].strip().upper() == b"BINARY"
     kinds = np.full(count, 7, ">i4").tobytes() if binary else b"7 " * count
     return _polygons(text + b"\n\nCELL_TYPES %d\n" % count + kinds + b"\n", ".vtk")
 
 
 def _polygons(text: bytes, suffix: str) -> meshio.Mesh:
-    """Return the content of a file of polygons, those of three corners as triangles."""
+    """Return the content of a file of polygons; polygons of three corners become triangles."""
     with tempfile.TemporaryDirectory() as folder:
         (path := Path(folder) / f"polygons{suffix}").write_bytes(text)
         content = _read(path)
     kinds = {3: "triangle", 4: "quad"}
-    cells = [(kinds.get(each.data.shape[1], "polygon"), each.data) for each in content.cells]
+    cells = [(kinds.get(block.data.shape[1], "polygon"), block.data) for block in content.cells]
     return meshio.Mesh(content.points, cells)
 
 
@@ -214,7 +214,7 @@ def _read_abaqus(path: Path) -> meshio.Mesh:
             sets[kind].setdefault(name.upper(), []).extend(members)
             names.setdefault(name.upper(), name)
     of_set = {name: numbers("ELSET", name) for name in sets["ELSET"]}
-    corners = {k: own for of_kind in elements.values() for k, own in of_kind.items()}
+    corners = {k: row for of_kind in elements.values() for k, row in of_kind.items()}
     for name, rows in sets["FACES"].items():
         faces = {
             f"{name} {k} {face}": [corners[k][c] for c in _FACES[face.upper()]]
@@ -229,14 +229,14 @@ def _read_abaqus(path: Path) -> meshio.Mesh:
     place = {number: k for k, number in enumerate(nodes)}
     elements = {kind: of_kind for kind, of_kind in elements.items() if of_kind}
     data = {}
-    for name, own in of_set.items():
-        member = {kind: np.isin([*each], own).astype(int) for kind, each in elements.items()}
-        lower = [each.any() for kind, each in member.items() if kind.startswith(("tri", "line"))]
+    for name, members in of_set.items():
+        member = {kind: np.isin([*mask], members).astype(int) for kind, mask in elements.items()}
+        lower = [mask.any() for kind, mask in member.items() if kind.startswith(("tri", "line"))]
         data[f"set:{names[name]}" if any(lower) else names[name]] = [*member.values()]
     return meshio.Mesh(
         np.array([[float(word or 0) for word in xyz[:3]] for xyz in nodes.values()]),
         {
-            kind: np.array([[place[k] for k in own] for own in of_kind.values()])
+            kind: np.array([[place[k] for k in row] for row in of_kind.values()])
             for kind, of_kind in elements.items()
         },
         cell_data=data,
@@ -345,16 +345,16 @@ def _groups(content: meshio.Mesh) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def tag_array(content: meshio.Mesh) -> tuple[str | None, dict[int, list[str]]]:
-    """Return the cell data that numbers groups, and names of groups by their number, if it has any.
+    """Return the name of the cell data that numbers groups, and the groups' names by number.
 
     It is Gmsh's, or the first that numbers triangles. MED has names, and meshio writes its sets as
     one array from -1, for none, called by all names.
     """
-    if TAG in content.cell_data and any(np.any(each) for each in content.cell_data[TAG]):
+    if TAG in content.cell_data and any(np.any(values) for values in content.cell_data[TAG]):
         return TAG, {}
-    faces = np.concatenate([np.full(len(each.data), each.dim == 2) for each in content.cells])
+    faces = np.concatenate([np.full(len(block.data), block.dim == 2) for block in content.cells])
     for name, data in content.cell_data.items():
-        numbers = np.concatenate([np.ravel(each) for each in data])
+        numbers = np.concatenate([np.ravel(values) for values in data])
         if name.startswith(MARK) or name.endswith(_OF_GMSH) or len(numbers) != len(faces):
             continue
         parts, of_faces = name.split("-"), numbers[faces]

@@ -81,8 +81,8 @@ class Ventricle:
         k, count = np.broadcast_to(self.axis, self.normal.shape), len(self.normal)
         lean = np.broadcast_to(self.lean, (count, 3))
         around = np.cross(self.axis, self.across)
-        each = (self.normal, self.circumference, k, self.across, around, lean, np.cross(k, lean))
-        return np.stack(each, axis=1)
+        rows = (self.normal, self.circumference, k, self.across, around, lean, np.cross(k, lean))
+        return np.stack(rows, axis=1)
 
 
 def ventricle(mesh: Mesh, endocardium: str, fixed: np.ndarray) -> Ventricle:

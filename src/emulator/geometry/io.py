@@ -94,22 +94,22 @@ def read_body(source: str | Path | Any, *, quadratic: bool = False) -> Body:
     with _content(source) as content:
         mesh, numbers, left = _mesh(content)
         order = 2 if quadratic else mesh.order
-        found: dict[str, np.ndarray | None] = dict.fromkeys(_NAMES)
+        directions: dict[str, np.ndarray | None] = dict.fromkeys(_NAMES)
         used = [tag_array(content)[0]]
         for kind, pattern in _NAMES.items():
             names = (kind, *content.cell_data, *content.point_data)
-            for name in (each for each in names if re.fullmatch(pattern, each, re.IGNORECASE)):
+            for name in (label for label in names if re.fullmatch(pattern, label, re.IGNORECASE)):
                 try:
-                    found[kind] = _directions(content, mesh, numbers, name, order)
+                    directions[kind] = _directions(content, mesh, numbers, name, order)
                 except InputError as error:
                     if name == kind:
                         raise
                     left.append(str(error))
                     used.append(name)
-                if found[kind] is not None:
+                if directions[kind] is not None:
                     used.append(name)
                     break
-        fibres, sheets = found.values()
+        fibres, sheets = directions.values()
         if fibres is not None and sheets is not None and fibres.ndim == 3:
             # Interpolation does not preserve orthogonality.
             skew = np.quantile(np.abs(np.sum(fibres * sheets, axis=-1)), 0.9)
@@ -177,8 +177,8 @@ def write_mesh(
         )
         if values is not None
     }
-    file, suffix, own = f"mesh file {path}", Path(path).suffix, _own_node_sets(mesh)
-    both = next((name for name in own if name in mesh.facet_sets), None)
+    file, suffix, node_sets = f"mesh file {path}", Path(path).suffix, _own_node_sets(mesh)
+    both = next((name for name in node_sets if name in mesh.facet_sets), None)
     if suffix not in (".msh", ".vtu", ".xdmf"):
         raise InputError(f"{file}: cannot write '{suffix}'; use .msh, .vtu or .xdmf")
     if suffix == ".xdmf" and mesh.order == 2 and mesh.facet_sets:
@@ -192,9 +192,9 @@ def write_mesh(
         )
     options: dict[str, Any]
     if suffix == ".msh":
-        content, options = _with_tags(mesh, own), {"file_format": "gmsh22", "binary": True}
+        content, options = _with_tags(mesh, node_sets), {"file_format": "gmsh22", "binary": True}
     else:
-        content, options = _with_marks(mesh, own, directions), {"file_format": suffix[1:]}
+        content, options = _with_marks(mesh, node_sets, directions), {"file_format": suffix[1:]}
         if suffix == ".xdmf":  # by default to a second file, named after the temporary one
             options["data_format"] = "XML"
     with replacing(path) as temporary:
@@ -367,7 +367,7 @@ def _check_lengths(values: np.ndarray, name: str, where: str) -> np.ndarray:
 
 
 def _own_node_sets(mesh: Mesh) -> Sets:
-    """Return the node sets that do not follow from the facet set of the same name."""
+    """Return the node sets that do not follow from the facet set of their name."""
     return {
         name: nodes
         for name, nodes in mesh.node_sets.items()
@@ -375,11 +375,11 @@ def _own_node_sets(mesh: Mesh) -> Sets:
     }
 
 
-def _with_tags(mesh: Mesh, own: Sets) -> meshio.Mesh:
+def _with_tags(mesh: Mesh, node_sets: Sets) -> meshio.Mesh:
     """Return the sets as gmsh's physical groups; a facet or node in two sets is written twice."""
     solid, triangle = _CELLS[mesh.order]
     groups = [(2, triangle, name, rows) for name, rows in mesh.facet_sets.items()]
-    groups += [(0, "vertex", name, nodes[:, None]) for name, nodes in own.items()]
+    groups += [(0, "vertex", name, nodes[:, None]) for name, nodes in node_sets.items()]
     blocks = [(solid, mesh.elements), *((kind, rows) for _, kind, _, rows in groups)]
     tags = [np.full(len(rows), tag) for tag, (_, rows) in enumerate(blocks)]
     names = {name: np.array([k, dim]) for k, (dim, _, name, _) in enumerate(groups, start=1)}
@@ -387,7 +387,7 @@ def _with_tags(mesh: Mesh, own: Sets) -> meshio.Mesh:
     return meshio.Mesh(mesh.nodes, blocks, cell_data=data, field_data=names)
 
 
-def _with_marks(mesh: Mesh, own: Sets, directions: Sets) -> meshio.Mesh:
+def _with_marks(mesh: Mesh, node_sets: Sets, directions: Sets) -> meshio.Mesh:
     """Return the sets as data of 0 and 1 on triangles and points."""
 
     def mark(members: np.ndarray, count: int) -> np.ndarray:
@@ -404,5 +404,5 @@ def _with_marks(mesh: Mesh, own: Sets, directions: Sets) -> meshio.Mesh:
         none = np.zeros(len(mesh.elements), np.int32)
         for name, facets in mesh.facet_sets.items():
             data[MARK + name] = [none, mark(find_rows(facets, rows), len(rows))]
-    points = {MARK + name: mark(nodes, len(mesh.nodes)) for name, nodes in own.items()}
+    points = {MARK + name: mark(nodes, len(mesh.nodes)) for name, nodes in node_sets.items()}
     return meshio.Mesh(mesh.nodes, blocks, cell_data=data, point_data=points)

@@ -115,31 +115,33 @@ def mesh_heart(
     look_up(IN_MM, unit, "unit")
     if smooth < 0 or not least > 0.0:
         raise InputError(f"smooth {smooth}, least {least} mm: expected 0 times or more, above 0 mm")
-    given = [
+    originals = [
         surface_in_mm(source, name, unit)
         for source, name in ((endocardium, LEFT), (right, RIGHT), (epicardium, EPICARDIUM))
     ]
-    _joints(given)
-    inner, outer = [smoothed(each, smooth) for each in given[:2]], smoothed(given[2], smooth)
+    _joints(originals)
+    *inner, outer = (smoothed(surface, smooth) for surface in originals)
     _check_places([*inner, outer])
-    moved = [*inner, _away(outer, inner, least)]
-    surfaces = [*inner, _without_edge(moved[2], inner)]
-    axis = axis_to_rims(given[0])
-    make = partial(_mesh, [DiscMap(each) for each in surfaces], _joints(surfaces), axis, order)
+    outside = _away(outer, inner, least)
+    surfaces = [*inner, _without_edge(outside, inner)]
+    axis = axis_to_rims(originals[0])
+    make = partial(_mesh, [*map(DiscMap, surfaces)], _joints(surfaces), axis, order)
     thickness = thickness_of(distances(surfaces[0].points, surfaces[1:]))
-    area = sum(each.area for each in surfaces)
+    area = sum(surface.area for surface in surfaces)
     length, before = mesh_that_fits(
-        make, thickness, size, np.sqrt(area / _SQUARES), given[2].extent
+        make, thickness, size, np.sqrt(area / _SQUARES), originals[2].extent
     )
-    rims = np.concatenate([given[0].points[loop] for loop in rim_loops(given[0])])
+    rims = np.concatenate([originals[0].points[loop] for loop in rim_loops(originals[0])])
     return measured(
         before,
-        given,
+        originals,
         axis=axis,
         base=rims.mean(axis=0),
         size=length,
         thickness=thickness,
-        moved=farthest(*(s.points for pair in zip(given, moved, strict=True) for s in pair)),
+        shift=farthest(
+            *(s.points for pair in zip(originals, [*inner, outside], strict=True) for s in pair)
+        ),
     )
 
 
@@ -148,34 +150,35 @@ Joint = list[tuple[int, int]]
 
 
 def _joints(surfaces: Sequence[Surface]) -> dict[str, Joint]:
-    """Return the openings that belong together, by the name of what is between them."""
-    loops = [rim_loops(each) for each in surfaces]
-    for each, own in zip(surfaces, loops, strict=True):
-        if not own:
-            raise InputError(f"{each.name}: it is closed; expected it open at valves or base")
+    """Return the openings of inner and outer surface that belong together, by valve or base."""
+    loops = [rim_loops(surface) for surface in surfaces]
+    for surface, rims in zip(surfaces, loops, strict=True):
+        if not rims:
+            raise InputError(f"{surface.name}: it is closed; expected it open at valves or base")
     outer = [surfaces[2].points[loop] for loop in loops[2]]
     trees = [cKDTree(rim, balanced_tree=False) for rim in outer]
     joints: dict[int, Joint] = {}
     names: dict[int, str] = {}
-    for k, (each, own) in enumerate(zip(surfaces[:2], loops[:2], strict=True)):
-        if len(own) > len(VALVES[each.name]):
+    for k, (surface, rims) in enumerate(zip(surfaces[:2], loops[:2], strict=True)):
+        if len(rims) > len(VALVES[surface.name]):
             raise InputError(
-                f"{each.name}: it has {len(own)} openings, the smallest of {len(own[-1])} edges at "
-                f"{place_of(each.points[own[-1]].mean(axis=0))}; expected two valves at most: fill "
-                "the others"
+                f"{surface.name}: it has {len(rims)} openings, the smallest of {len(rims[-1])} "
+                f"edges at {place_of(surface.points[rims[-1]].mean(axis=0))}; expected two valves "
+                "at most: fill the others"
             )
-        for number, loop in enumerate(own):
-            rim = each.points[loop]
+        for number, loop in enumerate(rims):
+            rim = surface.points[loop]
             ways = [tree.query(rim)[0].mean() for tree in trees]
             nearest = int(np.argmin(ways))
             radius = np.sqrt(np.linalg.norm(area_vector(rim)) / np.pi)
             if ways[nearest] > _ASTRAY * radius:
                 raise InputError(
-                    f"{each.name}: no opening of the epicardium is at its opening around "
+                    f"{surface.name}: no opening of the epicardium is at its opening around "
                     f"{place_of(rim.mean(axis=0))}; the nearest is {ways[nearest]:.3g} mm away"
                 )
             joints.setdefault(nearest, [(2, nearest)]).append((k, number))
-            names[nearest] = VALVES[each.name][number] if len(own) > 1 else f"{each.name}_base"
+            valves = VALVES[surface.name]
+            names[nearest] = valves[number] if len(rims) > 1 else f"{surface.name}_base"
     for number, rim in enumerate(outer):
         if number not in joints:
             raise InputError(
@@ -185,8 +188,8 @@ def _joints(surfaces: Sequence[Surface]) -> dict[str, Joint]:
     if len(joints) == 1:
         return {"base": joints[0]}
     return {
-        names[n] if len(own) == 2 else f"{surfaces[own[1][0]].name}_base": own
-        for n, own in joints.items()
+        names[n] if len(openings) == 2 else f"{surfaces[openings[1][0]].name}_base": openings
+        for n, openings in joints.items()
     }
 
 
@@ -197,41 +200,41 @@ def _check_places(surfaces: Sequence[Surface]) -> None:
         if np.median(distances(one.points, [other])) < _SAME * outer.extent:
             raise InputError(f"{one.name} and {other.name} are one surface; give three")
     up = np.eye(3)[2]
-    whole = {each.name: closed(each) for each in surfaces}
-    for each in (left, right):
-        if inside(whole[each.name], outer.points, up).mean() > 0.5:
+    whole = {surface.name: closed(surface) for surface in surfaces}
+    for surface in (left, right):
+        if inside(whole[surface.name], outer.points, up).mean() > 0.5:
             raise InputError(
-                f"{each.name} and {outer.name} are swapped: the epicardium lies within it"
+                f"{surface.name} and {outer.name} are swapped: the epicardium lies within it"
             )
-        out = ~inside(whole[outer.name], each.points, up)
-        rims = cKDTree(each.points[np.concatenate(rim_loops(each))], balanced_tree=False)
-        out &= rims.query(each.points)[0] > _LEAST  # where surfaces meet, round-off decides
+        out = ~inside(whole[outer.name], surface.points, up)
+        rims = cKDTree(surface.points[np.concatenate(rim_loops(surface))], balanced_tree=False)
+        out &= rims.query(surface.points)[0] > _LEAST  # where surfaces meet, round-off decides
         if out.all():
             raise InputError(
-                f"{each.name} lies outside of the epicardium: its middle is at "
-                f"{place_of(each.points.mean(axis=0))}"
+                f"{surface.name} lies outside of the epicardium: its middle is at "
+                f"{place_of(surface.points.mean(axis=0))}"
             )
         if out.any():
             raise InputError(
-                f"{each.name} crosses the epicardium: {int(out.sum())} of its points are outside, "
-                f"around {place_of(each.points[out].mean(axis=0))}; repair them there"
+                f"{surface.name} crosses the epicardium: {int(out.sum())} of its points are outside"
+                f", around {place_of(surface.points[out].mean(axis=0))}; repair them there"
             )
-    for each, other in ((left, right), (right, left)):
-        within = inside(whole[other.name], each.points, up)
+    for surface, other in ((left, right), (right, left)):
+        within = inside(whole[other.name], surface.points, up)
         if within.any():
             raise InputError(
-                f"{each.name} crosses {other.name}: {int(within.sum())} of its points are inside, "
-                f"around {place_of(each.points[within].mean(axis=0))}; repair them there"
+                f"{surface.name} crosses {other.name}: {int(within.sum())} of its points are inside"
+                f", around {place_of(surface.points[within].mean(axis=0))}; repair them there"
             )
 
 
 def _away(outer: Surface, inner: Sequence[Surface], least: float) -> Surface:
-    """Return the epicardium with its points at least so many mm from both endocardia."""
+    """Return the epicardium with its points at least ``least`` mm from both endocardia."""
     places, normals = (
-        np.vstack([sampled(each, values(each), _FINE * least) for each in inner])
-        for values in (lambda each: each.points, lambda each: each.normals)
+        np.vstack([sampled(surface, values(surface), _FINE * least) for surface in inner])
+        for values in (lambda surface: surface.points, lambda surface: surface.normals)
     )
-    rims = np.vstack([each.points[loop] for each in inner for loop in rim_loops(each)])
+    rims = np.vstack([surface.points[loop] for surface in inner for loop in rim_loops(surface)])
     to_rim = cKDTree(rims, balanced_tree=False).query(outer.points)[0]
     h = np.minimum(least, _SLOPE * to_rim)
     distance, nearest = cKDTree(places, balanced_tree=False).query(outer.points)
@@ -244,17 +247,17 @@ def _away(outer: Surface, inner: Sequence[Surface], least: float) -> Surface:
 
 
 def _without_edge(outer: Surface, inner: Sequence[Surface]) -> Surface:
-    """Return the epicardium less a ring at each rim that meets an endocardium's.
+    """Return the epicardium without a ring at each of its rims that meets an endocardium's rim.
 
-    Less where rims are so near to each other that what is left between them would be narrow.
+    The ring is narrower where rims are so near to each other that little would be left between.
     """
-    rims = np.vstack([each.points[loop] for each in inner for loop in rim_loops(each)])
-    own = rim_loops(outer)
-    trees = [cKDTree(outer.points[loop], balanced_tree=False) for loop in own]
-    pairs = combinations(range(len(own)), 2)
-    between = [trees[k].query(outer.points[own[other]])[0].min() for k, other in pairs]
+    rims = np.vstack([surface.points[loop] for surface in inner for loop in rim_loops(surface)])
+    loops = rim_loops(outer)
+    trees = [cKDTree(outer.points[loop], balanced_tree=False) for loop in loops]
+    pairs = combinations(range(len(loops)), 2)
+    between = [trees[k].query(outer.points[loops[other]])[0].min() for k, other in pairs]
     to_rim = cKDTree(rims, balanced_tree=False).query(outer.points)[0]
-    meeting = [loop for loop in own if to_rim[loop].mean() < _LEAST]
+    meeting = [loop for loop in loops if to_rim[loop].mean() < _LEAST]
     if not meeting:
         return outer
     edges = np.unique(np.sort(outer.triangles[:, SIDES].reshape(-1, 2), axis=1), axis=0)
@@ -268,23 +271,24 @@ def _mesh(
     maps: Sequence[DiscMap], joints: Mapping[str, Joint], axis: np.ndarray, order: int, size: float
 ) -> Mesh:
     """Return the walls between three surfaces, the epicardium last."""
-    new = [each.remeshed(size) for each in maps]
+    new = [disc_map.remeshed(size) for disc_map in maps]
     outer, up = closed(new[2].surface), np.eye(3)[2]
-    for each, other in ((new[0], new[1]), (new[1], new[0])):
-        points = each.surface.points
-        rims = cKDTree(points[np.concatenate(each.loops)], balanced_tree=False)
+    for triangulation, other in ((new[0], new[1]), (new[1], new[0])):
+        points = triangulation.surface.points
+        rims = cKDTree(points[np.concatenate(triangulation.loops)], balanced_tree=False)
         points = points[rims.query(points)[0] > size]  # a lid may be below a rim's points
         bad = ~inside(outer, points, up) | inside(closed(other.surface), points, up)
         if bad.any():
             raise Unmeshable(
                 f"the wall is too thin for edges of {size:.3g} mm at {place_of(points[bad][0])}"
             )
-    points = np.vstack([each.surface.points for each in new])
-    first = np.cumsum([0, *(len(each.surface.points) for each in new)])
+    points = np.vstack([triangulation.surface.points for triangulation in new])
+    first = np.cumsum([0, *(len(triangulation.surface.points) for triangulation in new)])
     facets, more = dict[str, np.ndarray](), np.zeros((0, 3))
     for name, openings in joints.items():
         loops = [first[k] + new[k].loops[number] for k, number in openings]
-        if len(loops) == 2 and _way(*(points[loop] for loop in loops)) < _NARROW * size:
+        rims_at = [points[loop] for loop in loops]
+        if len(loops) == 2 and directed_hausdorff(*rims_at) < _NARROW * size:
             facets[name] = zipped(points, *loops)
             continue
         facets[name], added = _patch(points, loops, size, len(points) + len(more))
@@ -303,9 +307,9 @@ def _mesh(
     return Mesh(mesh.nodes, mesh.elements, sets, {**mesh.facet_sets, "base": base})
 
 
-def _way(one: np.ndarray, other: np.ndarray) -> float:
-    """Return the largest distance in mm of points (k, 3) to the others (l, 3)."""
-    return float(cKDTree(other, balanced_tree=False).query(one)[0].max())
+def directed_hausdorff(points: np.ndarray, reference: np.ndarray) -> float:
+    """Return the directed Hausdorff distance in mm from ``points`` (k, 3) to ``reference``."""
+    return float(cKDTree(reference, balanced_tree=False).query(points)[0].max())
 
 
 def zipped(points: np.ndarray, one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -319,7 +323,7 @@ def zipped(points: np.ndarray, one: np.ndarray, other: np.ndarray) -> np.ndarray
     for loop in loops:
         steps = np.linalg.norm(np.diff(points[loop], axis=0), axis=1)
         shares.append(np.concatenate([[0.0], np.cumsum(steps)]) / steps.sum())
-    ends = [(share, k) for k, own in enumerate(shares) for share in own[1:].tolist()]
+    ends = [(share, k) for k, fractions in enumerate(shares) for share in fractions[1:].tolist()]
     at, rows = [0, 0], []
     for _, k in sorted(ends):
         rows.append((loops[0][at[0]], loops[1][at[1]], loops[k][at[k] + 1]))

@@ -47,7 +47,7 @@ class LeftWall(NamedTuple):
 
 
 def left_wall(endocardium: Surface, epicardium: Surface, right: Surface) -> LeftWall:
-    """Return the outside of the left ventricle's wall, and where its base is.
+    """Return the outer surface of the left ventricle's wall, its axis and its base height.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def left_wall(endocardium: Surface, epicardium: Surface, right: Surface) -> Left
             f"the epicardium and the right ventricle are {median:.3g} mm away from the left "
             f"endocardium, of {endocardium.extent:.3g} mm: are they of one heart, in one unit?"
         )
-    around = [sampled(each, each.points, _MET * median) for each in (epicardium, right)]
+    around = [sampled(surface, surface.points, _MET * median) for surface in (epicardium, right)]
     tree = cKDTree(np.vstack(around), balanced_tree=False)
     nearest = tree.query(endocardium.points)[0]
     ways = nearest.copy()

@@ -87,7 +87,7 @@ def _check_polygons(loops: Sequence[np.ndarray]) -> None:
     ends = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops])
 
     def side(points: np.ndarray) -> np.ndarray:
-        """Return on which side of each edge (e,) points (e', 2) lie, (e, e')."""
+        """Return the side of each edge (e,) that points (e', 2) lie on, (e, e')."""
         along, to = (ends - starts)[:, None], points[None] - starts[:, None]
         return np.sign(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0])
 
@@ -133,7 +133,7 @@ def tetrahedralise(
 
 
 def _cells(gmsh: Any, corners: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the nodes in the order of their tags, those given first, and the elements."""
+    """Return the nodes in the order of their tags, and the elements; input nodes come first."""
     tags, places, _ = gmsh.model.mesh.getNodes()
     order = np.argsort(tags)
     _, rows = gmsh.model.mesh.getElementsByType(_TYPES[corners])
@@ -200,7 +200,7 @@ class Remeshed(NamedTuple):
     def loops(self) -> list[np.ndarray]:
         """The points (k,) of each rim, in order."""
         ends = np.cumsum(self.counts)
-        return [np.arange(end - own, end) for end, own in zip(ends, self.counts, strict=True)]
+        return [np.arange(end - count, end) for end, count in zip(ends, self.counts, strict=True)]
 
 
 class Rim(NamedTuple):
@@ -243,8 +243,8 @@ class DiscMap:
             raise InputError(f"{surface.name}: it is closed; only a surface with a rim is mapped")
         whole = closed(surface, loops[1:])
         curves = [surface.points[[*loop, loop[0]]] for loop in loops]
-        steps = [np.linalg.norm(np.diff(each, axis=0), axis=1) for each in curves]
-        along = [np.concatenate([[0.0], np.cumsum(each)]) for each in steps]
+        steps = [np.linalg.norm(np.diff(curve, axis=0), axis=1) for curve in curves]
+        along = [np.concatenate([[0.0], np.cumsum(lengths)]) for lengths in steps]
         turn = 2.0 * np.pi * along[0][:-1] / along[0][-1]
         places = np.zeros((len(whole.points), 2))
         places[loops[0]] = np.column_stack([np.cos(turn), np.sin(turn)])
@@ -277,11 +277,11 @@ class DiscMap:
         turns = [np.arange(count) / count for count in counts]
         circle = 2.0 * np.pi * turns[0]
         polygons = [np.column_stack([np.cos(circle), np.sin(circle)])]
-        polygons += [rim.place(own) for rim, own in zip(self.rims[1:], turns[1:], strict=True)]
+        polygons += [rim.place(turn) for rim, turn in zip(self.rims[1:], turns[1:], strict=True)]
         nearest, stretch = cKDTree(self.places, balanced_tree=False), self._stretch()
         places, rows = triangulate(polygons, lambda x, y: size / stretch[nearest.query((x, y))[1]])
         points = self.at(places)
-        on_rims = [rim.at(own) for rim, own in zip(self.rims, turns, strict=True)]
+        on_rims = [rim.at(turn) for rim, turn in zip(self.rims, turns, strict=True)]
         points[: sum(counts)] = np.concatenate(on_rims)
         now, before = (
             np.sign(np.sum(signed_areas(corners)))
@@ -303,11 +303,11 @@ class DiscMap:
         rows = self.surface.triangles
         on_surface = 0.5 * np.linalg.norm(cross_sides(self.surface.points[rows]), axis=1)
         areas = [
-            np.bincount(rows.ravel(), np.repeat(each, 3), len(self.places))
-            for each in (on_surface, np.abs(signed_areas(self.places[rows])))
+            np.bincount(rows.ravel(), np.repeat(area, 3), len(self.places))
+            for area in (on_surface, np.abs(signed_areas(self.places[rows])))
         ]
         # Areas over two rings of neighbours, because rough surfaces have upright triangles.
-        around = [np.bincount(rows.ravel(), each[rows].sum(1).repeat(3)) for each in areas]
+        around = [np.bincount(rows.ravel(), area[rows].sum(1).repeat(3)) for area in areas]
         return np.sqrt(around[0] / np.maximum(around[1], 1e-30))
 
     def middles(self, new: Remeshed, edges: np.ndarray) -> np.ndarray:

@@ -105,19 +105,19 @@ def mesh_wall(
             if base_height is None and base_point is None:
                 base_height = left.height
     normal, point = _plane(intact, axis, base_height, base_point)
-    below = [cut(each, point, normal) for each in intact]
-    for each in below:
-        rim = each.points[one_rim(each)] @ normal
+    below = [cut(surface, point, normal) for surface in intact]
+    for surface in below:
+        rim = surface.points[one_rim(surface)] @ normal
         if rim.min() < point @ normal - _SAME * intact[1].extent:
             raise InputError(
-                f"{each.name}: its opening reaches below the base plane, down to {rim.min():.4g} "
-                f"mm along the axis, the plane being at {point @ normal:.4g}; expected a lower "
+                f"{surface.name}: its opening reaches below the base plane, down to {rim.min():.4g}"
+                f" mm along the axis, the plane being at {point @ normal:.4g}; expected a lower "
                 "one: --base-height or --base-point"
             )
-    height = max(((each.points - point) @ normal).max() for each in intact)
+    height = max(((surface.points - point) @ normal).max() for surface in intact)
     above = (intact[1].volume - below[1].volume) / MM3_PER_ML
     is_cut = height > _SAME * intact[1].extent
-    inner, outer = (smoothed(each, smooth) for each in below)
+    inner, outer = (smoothed(surface, smooth) for surface in below)
     _check_nested(inner, outer, normal)
     thickness = thickness_of(distances(inner.points, [outer]))
     make = partial(_mesh, [DiscMap(inner), DiscMap(outer)], normal, point, order)
@@ -131,15 +131,16 @@ def mesh_wall(
         base=below[0].points[np.unique(one_rim(below[0]))].mean(axis=0),
         size=length,
         thickness=thickness,
-        moved=farthest(inner.points, below[0].points, outer.points, below[1].points),
+        shift=farthest(inner.points, below[0].points, outer.points, below[1].points),
         cut_off=(float(height), above) if is_cut else (0.0, 0.0),
     )
     return replace(wall, warnings=tuple(_doubts(wall, inner.volume / MM3_PER_ML)))
 
 
 def _doubts(wall: Wall, smooth_cavity: float) -> Iterator[str]:
-    """Yield what is doubtful of a wall, whose smoothed endocardium encloses so many mL."""
-    (cavity, own), (volume, _), (_, above) = *wall.cavities.values(), wall.wall, wall.cut_off
+    """Yield a sentence per doubt about a wall; ``smooth_cavity`` mL are in the smooth surface."""
+    [(cavity, surface_cavity)], (volume, _) = wall.cavities.values(), wall.wall
+    _, above = wall.cut_off
     if above > cavity + volume:
         x, y, z = -wall.axis + 0.0
         yield (
@@ -166,7 +167,7 @@ def _doubts(wall: Wall, smooth_cavity: float) -> Iterator[str]:
     if abs(cavity / smooth_cavity - 1.0) > 0.01:
         remedy = "a smaller --size, or --order 2" if wall.mesh.order == 1 else "a smaller --size"
         yield f"the cavity is more than 1 % off: choose {remedy}"
-    elif abs(cavity / own - 1.0) > 0.01:
+    elif abs(cavity / surface_cavity - 1.0) > 0.01:
         yield "smoothing made the cavity more than 1 % off: choose fewer times, --smooth"
 
 
@@ -184,7 +185,7 @@ def _plane(
     has_plane = height is not None or point is not None
     # Openings above a plane that is given do not matter, and what is below it is cut first.
     of_rims = [] if has_plane and axis is not None else surfaces
-    rims = [(each, one_rim(each)) for each in of_rims if each.rims or not has_plane]
+    rims = [(surface, one_rim(surface)) for surface in of_rims if surface.rims or not has_plane]
     normal = np.zeros(3) if axis is None else np.asarray(axis, dtype=float)
     if axis is None:
         if len(rims) < len(surfaces):
@@ -192,9 +193,10 @@ def _plane(
                 "long axis: give it, from apex to base (--axis X Y Z); it is found only where both "
                 "surfaces are open at the base"
             )
-        for each, edges in rims:
-            normal += np.cross(each.points[edges[:, 0]], each.points[edges[:, 1]]).sum(axis=0)
-        middle = np.mean([each.points[edges].mean(axis=(0, 1)) for each, edges in rims], axis=0)
+        ends = [surface.points[edges] for surface, edges in rims]
+        for x in ends:
+            normal += np.cross(x[:, 0], x[:, 1]).sum(axis=0)
+        middle = np.mean([x.mean(axis=(0, 1)) for x in ends], axis=0)
         normal *= np.sign((middle - surfaces[1].points.mean(axis=0)) @ normal)
     if normal.shape != (3,) or not np.isfinite(normal).all() or not normal.any():
         raise InputError(f"long axis {axis}: expected three numbers, not all zero: --axis X Y Z")
@@ -207,7 +209,7 @@ def _plane(
                 "--base-height, or three numbers, --base-point X Y Z"
             )
         return normal, place
-    levels = np.concatenate([each.points[np.unique(edges)] @ normal for each, edges in rims])
+    levels = np.concatenate([surface.points[np.unique(edges)] @ normal for surface, edges in rims])
     tall = np.ptp(surfaces[1].points @ normal)
     if np.ptp(levels) > _MOST_CUT * tall:
         raise InputError(
@@ -246,8 +248,8 @@ def _mesh(
     maps: Sequence[DiscMap], normal: np.ndarray, point: np.ndarray, order: int, size: float
 ) -> Mesh:
     """Return the wall between two surfaces, the inner one first, with flat rims in one plane."""
-    new = [each.remeshed(size) for each in maps]
-    inner, outer = (each.surface for each in new)
+    new = [disc_map.remeshed(size) for disc_map in maps]
+    inner, outer = (triangulation.surface for triangulation in new)
     outside = ~inside(outer, inner.points, normal)
     within = inside(inner, outer.points, normal)
     if (bad := np.concatenate([inner.points[outside], outer.points[within]])).size:

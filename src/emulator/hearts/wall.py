@@ -50,7 +50,7 @@ class Wall:
     cavities : the volumes in mL within each endocardium, of the mesh and of the surface below the
         base plane. wall : those of the tissue.
     cut_off : the height in mm and the epicardium's volume in mL above the base plane.
-    moved : the largest displacement in mm of a point of the surfaces.
+    shift : the largest displacement in mm of a point of the surfaces.
     folded : the number of elements that were folded, and the largest displacement in mm of a node
         that unfolded them.
     warnings : what is doubtful, a line each.
@@ -64,7 +64,7 @@ class Wall:
     cavities: Mapping[str, tuple[float, float]]
     wall: tuple[float, float]
     cut_off: tuple[float, float]
-    moved: float
+    shift: float
     folded: tuple[int, float]
     warnings: tuple[str, ...]
     quality: MeshQuality
@@ -73,7 +73,7 @@ class Wall:
         """Return the sum (n,) mm of the distances to the two nearest surfaces, at nodes."""
         nodes = self.mesh.nodes
         surfaces = (nodes[self.mesh.node_set(name)] for name in (*self.cavities, "epicardium"))
-        ways = [cKDTree(each, balanced_tree=False).query(nodes)[0] for each in surfaces]
+        ways = [cKDTree(points, balanced_tree=False).query(nodes)[0] for points in surfaces]
         return np.sort(ways, axis=0)[:2].sum(axis=0)
 
     def sentences(self) -> list[str]:
@@ -86,17 +86,17 @@ class Wall:
             f"median {self.thickness.median:.3g}; {self.wall[0]:.4g} mL, {self.wall[1]:.4g} "
             "between the surfaces",
         ]
-        for name, (cavity, own) in self.cavities.items():
+        for name, (cavity, volume) in self.cavities.items():
             of = "" if len(self.cavities) == 1 else f" of {name}"
             lines.append(
-                f"cavity{of} {cavity:.4g} mL, the surface's own {own:.4g} "
-                f"({100 * (cavity / own - 1):+.2f} %); over the wall {cavity / self.wall[0]:.3g}"
+                f"cavity{of} {cavity:.4g} mL, the surface's own {volume:.4g} "
+                f"({100 * (cavity / volume - 1):+.2f} %); over the wall {cavity / self.wall[0]:.3g}"
             )
         if self.cut_off[0] > 0.0:
             height, volume = self.cut_off
             lines.append(f"cut off {height:.3g} mm, {volume:.4g} mL, above the base plane")
-        if self.moved > 0.0:
-            lines.append(f"points of the surfaces were moved by {self.moved:.3g} mm at most")
+        if self.shift > 0.0:
+            lines.append(f"points of the surfaces were moved by {self.shift:.3g} mm at most")
         if self.folded[0]:
             lines.append(
                 f"{self.folded[0]} curved elements were folded, and straightened: nodes on their "
@@ -113,19 +113,19 @@ def measured(
     base: np.ndarray,
     size: float,
     thickness: Thickness,
-    moved: float,
+    shift: float,
     cut_off: tuple[float, float] = (0.0, 0.0),
 ) -> Wall:
-    """Return the wall of a mesh, unfolded, beside its surfaces, the epicardium last.
+    """Unfold a mesh and return it as a wall, measured beside its surfaces, the epicardium last.
 
     Parameters
     ----------
     before : the mesh, which may be curved so much that it folds.
     surfaces : what it was made from, named as its facet sets.
-    axis, base, size, thickness, moved, cut_off : see :class:`Wall`.
+    axis, base, size, thickness, shift, cut_off : see :class:`Wall`.
     """
     mesh, folded = unfolded(before) if before.order == 2 else (before, 0)
-    *cavities, whole = (each.volume / MM3_PER_ML for each in surfaces)
+    *cavities, whole = (surface.volume / MM3_PER_ML for surface in surfaces)
     named = zip(surfaces, cavities, strict=False)
     return Wall(
         mesh=mesh,
@@ -133,10 +133,10 @@ def measured(
         base=base,
         size=size,
         thickness=thickness,
-        cavities={each.name: (Cavity(mesh, each.name).rest, own) for each, own in named},
+        cavities={s.name: (Cavity(mesh, s.name).rest, volume) for s, volume in named},
         wall=(float(discretise(mesh).weights.sum()) / MM3_PER_ML, whole - sum(cavities)),
         cut_off=cut_off,
-        moved=moved,
+        shift=shift,
         folded=(folded, farthest(mesh.nodes, before.nodes)),
         warnings=(),
         quality=mesh_quality(mesh),
@@ -164,7 +164,7 @@ def surface_in_mm(source: str | Path | Surface, name: str, unit: str) -> Surface
 
 
 def distances(points: np.ndarray, around: Sequence[Surface]) -> np.ndarray:
-    """Return the distance (n,) mm of points to the nearest corner, middle or side of surfaces."""
+    """Return each point's distance (n,) mm to the nearest corner, middle or side of surfaces."""
     places = []
     for surface in around:
         corners = surface.points[surface.triangles]
@@ -174,7 +174,7 @@ def distances(points: np.ndarray, around: Sequence[Surface]) -> np.ndarray:
 
 
 def thickness_of(ways: np.ndarray) -> Thickness:
-    """Return least, median and most of distances (n,) mm."""
+    """Return the least, median and largest of distances (n,) mm."""
     return Thickness(float(ways.min()), float(np.median(ways)), float(ways.max()))
 
 
@@ -227,7 +227,7 @@ def fill(
     size: float,
     order: int,
 ) -> Mesh:
-    """Return the tetrahedra between surfaces and what joins their rims.
+    """Mesh the space between surfaces and the joints of their rims with tetrahedra.
 
     Parameters
     ----------
@@ -239,25 +239,26 @@ def fill(
     size : the longest edge aimed at inside, mm.
     order : of the elements; edges of quadratic ones follow the surfaces.
     """
-    first = np.cumsum([0, *(len(each.surface.points) for each in new)])[:-1]
-    rows = [each.surface.triangles + start for each, start in zip(new, first, strict=True)]
-    facets = {each.surface.name: own for each, own in zip(new, rows, strict=True)}
+    surfaces = [triangulation.surface for triangulation in new]
+    first = np.cumsum([0, *(len(surface.points) for surface in surfaces)])[:-1]
+    rows = [surface.triangles + start for surface, start in zip(surfaces, first, strict=True)]
+    facets = {surface.name: faces for surface, faces in zip(surfaces, rows, strict=True)}
     facets |= joints
-    points = np.vstack([*(each.surface.points for each in new), more])
+    points = np.vstack([*(surface.points for surface in surfaces), more])
     nodes, elements = tetrahedralise(points, np.concatenate([*facets.values()]), size)
-    sets = {name: np.unique(own) for name, own in facets.items()}
-    for each in new:
-        on_it = sets[each.surface.name]
-        sets[f"apex_{each.surface.name}"] = on_it[[np.argmin(nodes[on_it] @ axis)]]
+    sets = {name: np.unique(triangles) for name, triangles in facets.items()}
+    for surface in surfaces:
+        on_it = sets[surface.name]
+        sets[f"apex_{surface.name}"] = on_it[[np.argmin(nodes[on_it] @ axis)]]
     mesh = Mesh(nodes, orient(nodes, elements), sets, facets)
     if order == 1:
         return mesh
 
     def midpoints(edges: np.ndarray) -> np.ndarray:
         middle = mesh.nodes[edges].mean(axis=1)
-        for own, each, triangles, start in zip(rows, maps, new, first, strict=True):
-            on = find_rows(edges, own[:, SIDES].reshape(-1, 2)) >= 0
-            middle[on] = each.middles(triangles, edges[on] - start)
+        for triangles, disc_map, triangulation, start in zip(rows, maps, new, first, strict=True):
+            on = find_rows(edges, triangles[:, SIDES].reshape(-1, 2)) >= 0
+            middle[on] = disc_map.middles(triangulation, edges[on] - start)
         return middle
 
     return to_quadratic(mesh, midpoints)

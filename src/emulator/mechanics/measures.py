@@ -49,7 +49,7 @@ class _GradientRead(Exception):
     """The error raised where the law reads the displacement gradient itself."""
 
 
-def _given(name: str) -> property:
+def _measure(name: str) -> property:
     return property(lambda strain: strain.values[name])
 
 
@@ -72,14 +72,14 @@ class GivenStrain(Strain):
         """Raise, because the displacement gradient is unknown here."""
         raise _GradientRead
 
-    J_minus_1 = _given("J_minus_1")
-    I1_minus_3 = _given("I1_minus_3")
-    isochoric_I1_minus_3 = _given("isochoric_I1_minus_3")
-    isochoric_I2_minus_3 = _given("isochoric_I2_minus_3")
-    isochoric_I4f_minus_1 = _given("isochoric_I4f_minus_1")
-    isochoric_I4s_minus_1 = _given("isochoric_I4s_minus_1")
-    isochoric_I8fs = _given("isochoric_I8fs")
-    green_lagrange = _given("green_lagrange")
+    J_minus_1 = _measure("J_minus_1")
+    I1_minus_3 = _measure("I1_minus_3")
+    isochoric_I1_minus_3 = _measure("isochoric_I1_minus_3")
+    isochoric_I2_minus_3 = _measure("isochoric_I2_minus_3")
+    isochoric_I4f_minus_1 = _measure("isochoric_I4f_minus_1")
+    isochoric_I4s_minus_1 = _measure("isochoric_I4s_minus_1")
+    isochoric_I8fs = _measure("isochoric_I8fs")
+    green_lagrange = _measure("green_lagrange")
 
 
 class _Notes(dict[str, jax.Array]):

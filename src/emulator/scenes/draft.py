@@ -183,15 +183,15 @@ def _quoted(name: str) -> str:
 
 
 def _find_set(sets: Iterable[str], words: tuple[str, ...]) -> str | None:
-    """Return the set whose name contains the likeliest of ``words``, of the left heart if any."""
+    """Return the set whose name matches the earliest of ``words``, the left ventricle's first."""
     names = {}
     for name in sets:
         parted = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)
         names[name] = " ".join(re.findall("[a-z]+", parted.lower()))
     for word in words:
-        found = [name for name, label in names.items() if re.search(word, label)]
-        if found:
-            return min(found, key=lambda name: bool(re.search(r"\b(rv|right)\b", names[name])))
+        matches = [name for name, label in names.items() if re.search(word, label)]
+        if matches:
+            return min(matches, key=lambda name: bool(re.search(r"\b(rv|right)\b", names[name])))
     return None
 
 
@@ -257,20 +257,20 @@ def _support(mesh: Mesh, notes: list[str]) -> str:
         letter, at, where = _end(mesh, nodes)
         if f'axis = "{letter}"\nat = {at}\n' in "".join(sections):
             continue  # held with another part
-        own = f"held_{k}" if k > 1 else "held"
-        while own in mesh.node_sets:
-            own += "_"
+        set_name = f"held_{k}" if k > 1 else "held"
+        while set_name in mesh.node_sets:
+            set_name += "_"
         notes.append(f"{why}: held where {letter} is {where} mm; change it")
         sections.append(
-            f"[node_sets.{own}]   # CHANGE: {why.split(' (')[0]}\n"
-            f'axis = "{letter}"\nat = {at}\n\n[[supports]]\nnode_set = "{own}"'
+            f"[node_sets.{set_name}]   # CHANGE: {why.split(' (')[0]}\n"
+            f'axis = "{letter}"\nat = {at}\n\n[[supports]]\nnode_set = "{set_name}"'
         )
         why = "another part of the mesh"
     return "\n\n".join(sections)
 
 
 def _end(mesh: Mesh, nodes: np.ndarray) -> tuple[str, float | list[float], str]:
-    """Return where to hold the part of these nodes: axis, one or two coordinates mm, and words.
+    """Return where to fix the part of these nodes: axis, coordinates mm as TOML, and as text.
 
     On a flat face at an end, the end first where its longest axis is least; or between two planes
     that cut off that end.
@@ -309,7 +309,7 @@ def _loads(mesh: Mesh) -> list[tuple[list[Load], str, str, float]]:
             if _of_both(mesh):
                 pressures.append(kind(BOTH[1], parameter="right_pressure"))
             lines = "\n\n".join(map(_pressure, pressures))
-            note = " and ".join(f"'{each.facet_set}'" for each in pressures)
+            note = " and ".join(f"'{pressure.facet_set}'" for pressure in pressures)
             loads.append(([*pressures], lines, f"pressure on {note}", 1.0))
     gravity = f'[[loads]]   # CHANGE\nkind = "{Gravity.kind}"\ndensity = 1.06   # g/cm3\n'
     note = "its own weight along -z is the load; change it if you know another"

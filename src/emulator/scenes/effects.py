@@ -40,7 +40,7 @@ def effects_of(scene: Scene) -> dict[str, Effect]:
 
 
 def leave_out(scene: Scene, names: Iterable[str]) -> Scene:
-    """Return ``scene`` without the effects of these names, and without those that go with them.
+    """Return ``scene`` without the effects ``names``, and without effects that depend on them.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def _changes(scene: Scene) -> Iterator[tuple[str, dict[str, Any], str]]:
             if part.simpler is None:
                 continue
             name, other = part.simpler
-            remaining = [each for each in (*parts[:k], other, *parts[k + 1 :]) if each is not None]
+            remaining = [p for p in (*parts[:k], other, *parts[k + 1 :]) if p is not None]
             remedy = f"leave out '{part.kind}' in {table}"
             if other is not None:
                 remedy = f"in {table} write '{other.kind}' for '{part.kind}'"

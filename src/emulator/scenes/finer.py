@@ -57,10 +57,10 @@ def finer(scene: Scene) -> Finer:
         )
     _, fixed, per_unit = scene.prescribed
     displacements: dict[str | None, np.ndarray] = {None: refinement.carry(fixed)}
-    displacements |= {name: refinement.carry(each) for name, each in per_unit.items()}
+    displacements |= {name: refinement.carry(u) for name, u in per_unit.items()}
 
     def inherited(of_elements: np.ndarray | None) -> np.ndarray | None:
-        """Return what each finer element has from its parent."""
+        """Give every finer element the data of its parent."""
         return None if of_elements is None else np.repeat(of_elements, refinement.children, axis=0)
 
     fine = replace(

@@ -34,14 +34,14 @@ class LocalSum:
     nodes: np.ndarray
     data: Any
 
-    def _each(self, function: Callable, u: jax.Array, values: Values) -> jax.Array:
+    def _per_group(self, function: Callable, u: jax.Array, values: Values) -> jax.Array:
         """Return ``function(u, data_row, values)``, ``u`` (a, 3), of every group (k, ...)."""
         return jax.vmap(lambda v, d: function(v, d, values))(u[self.nodes], self.data)
 
     def _blocks(self, function: Callable, u: jax.Array, values: Values) -> jax.Array:
         """Return derivatives (a, 3, a, 3) of every group as blocks (k, 3a, 3a)."""
         size = 3 * self.nodes.shape[1]
-        return self._each(function, u, values).reshape(-1, size, size)
+        return self._per_group(function, u, values).reshape(-1, size, size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class LocalTerm(LocalSum):
 
     def energies(self, u: jax.Array, values: Values) -> jax.Array:
         """Return the energy (k,) in mN mm of each group."""
-        return self._each(self.energy, u, values)
+        return self._per_group(self.energy, u, values)
 
     def total(self, u: jax.Array, values: Values) -> jax.Array:
         """Return the sum, shape ()."""
@@ -80,7 +80,7 @@ class LocalForce(LocalSum):
 
     def total(self, u: jax.Array, values: Values) -> jax.Array:
         """Return the nodal force (n, 3) in mN."""
-        return jnp.zeros_like(u).at[self.nodes].add(self._each(self.force, u, values))
+        return jnp.zeros_like(u).at[self.nodes].add(self._per_group(self.force, u, values))
 
     def tangents(self, u: jax.Array, values: Values) -> jax.Array:
         """Return the derivatives (k, 3a, 3a) of minus the local forces, not symmetric."""
@@ -138,7 +138,7 @@ class Part(ABC):
         Numbers are floats, -0.0 is 0.0, and the entries of a tuple or an array stand one by one.
         The name of the parameter is None where the magnitude is a number.
         """
-        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
         if self.known is not None:
             values["parameter"] = None
         entries: list[Any] = [self.kind]

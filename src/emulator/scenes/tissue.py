@@ -75,8 +75,8 @@ def stiffness_of(
     values : the parameters of the scene by name.
     """
     of_regions, of_modes = (
-        jnp.stack([jnp.asarray(values[q.name]) for q in each]) if each else None
-        for each in (stiffness_quantities(regions, None), stiffness_quantities(None, modes))
+        jnp.stack([jnp.asarray(values[q.name]) for q in factors]) if factors else None
+        for factors in (stiffness_quantities(regions, None), stiffness_quantities(None, modes))
     )
     factor = None
     if of_regions is not None:
@@ -155,7 +155,7 @@ class FibreAngles:
         return tuple(Quantity(name, "deg", -360.0, 360.0) for name in self.shares)
 
     def checked(self, mesh: Mesh) -> FibreAngles:
-        """Return the same rotation with frozen arrays (m, q, ...).
+        """Return this rotation with frozen arrays (m, q, ...).
 
         Raises
         ------

@@ -101,7 +101,7 @@ class Emulator(TableRepr):
     record: Mapping[str, Any] = field(default_factory=dict)
 
     def summary_rows(self) -> tuple[str, list[tuple[str, str]]]:
-        """Return what it emulates, what it is made of, and how it was trained."""
+        """Return rows about the scene, the parts and the training of the emulator."""
         _, rows = self.scene.summary_rows()
         plan = self.record.get("plan", {})
         about = [("parts", " + ".join(self.parts) or "none")]
@@ -219,8 +219,8 @@ class CachedEmulator:
         free = csr_array(rows.multiply(~held[None]))
         modes = free @ part.modes.reshape(-1, free.shape[1]).T
         prescribed = {
-            name: rows @ np.where(held, each[self.nodes].ravel(), 0.0)
-            for name, each in scene.prescribed.per_unit.items()
+            name: rows @ np.where(held, displacement[self.nodes].ravel(), 0.0)
+            for name, displacement in scene.prescribed.per_unit.items()
         }
         fixed = rows @ np.where(held, scene.held_displacement[self.nodes].ravel(), 0.0)
         offset = free @ part.offset.ravel() + fixed
@@ -228,9 +228,9 @@ class CachedEmulator:
         def values(theta: jax.Array) -> tuple[jax.Array, jax.Array]:
             inside = scene.space.contains(theta)
             safe = jnp.where(inside, theta, scene.centre)
-            found = offset + modes @ self.coefficients(safe)
+            free_values = offset + modes @ self.coefficients(safe)
             at = scene.resolve(safe)
-            return found + sum(at[name] * each for name, each in prescribed.items()), inside
+            return free_values + sum(at[name] * c for name, c in prescribed.items()), inside
 
         return values
 
@@ -246,7 +246,7 @@ class CachedEmulator:
         return lambda theta: work(jnp.where(scene.space.contains(theta), theta, scene.centre))
 
     def at(self, nodes: np.ndarray) -> CachedEmulator:
-        """Return the same map over ``nodes``, which must be among those cached."""
+        """Return this map restricted to ``nodes``, which must be among its nodes."""
         rows = rows_of(self, nodes)
         return replace(self, part=self.part.at(rows), nodes=self.nodes[rows])
 

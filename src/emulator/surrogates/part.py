@@ -54,7 +54,7 @@ def arrays_of(parts: Mapping[str, EmulatorPart]) -> dict[str, Any]:
 
 
 class ArrayPart:
-    """A part whose fields are all arrays, or named tuples of arrays: what files keep of it.
+    """A part whose fields are all arrays, or named tuples of arrays; files keep all of them.
 
     A dataclass that inherits from this class has its arrays written and read by their names; those
     of a named tuple ``warp`` are called ``warp/centre`` and so on.
@@ -62,7 +62,7 @@ class ArrayPart:
 
     def arrays(self) -> dict[str, Any]:
         """Return all arrays by name."""
-        values = ((each.name, getattr(self, each.name)) for each in fields(self))  # type: ignore[arg-type]
+        values = ((field.name, getattr(self, field.name)) for field in fields(self))  # type: ignore[arg-type]
         return named_leaves({n: v._asdict() if hasattr(v, "_asdict") else v for n, v in values})
 
     def to_json(self) -> dict[str, Any]:

@@ -104,8 +104,8 @@ def legendre(position: Any, degrees: np.ndarray) -> Any:
     rows = [xp.ones_like(t), t]
     for k in range(1, int(degrees.max())):
         rows.append(((2 * k + 1) * t * rows[k] - k * rows[k - 1]) / (k + 1))
-    each = xp.stack([sqrt(2 * k + 1) * row for k, row in enumerate(rows)], axis=-1)
-    return xp.prod(each[..., np.arange(degrees.shape[1]), degrees], axis=-1)
+    factors = xp.stack([sqrt(2 * k + 1) * row for k, row in enumerate(rows)], axis=-1)
+    return xp.prod(factors[..., np.arange(degrees.shape[1]), degrees], axis=-1)
 
 
 class Samples(NamedTuple):

@@ -59,21 +59,21 @@ def amount_of(force: SupportForce) -> str | None:
     None where there is none, or where the body is not in equilibrium as it lies.
     """
     scene = force.scene
-    own = np.zeros(len(scene.mesh.nodes), dtype=bool)
-    own[force.support_nodes] = True
+    at_support = np.zeros(len(scene.mesh.nodes), dtype=bool)
+    at_support[force.support_nodes] = True
     best, most = None, _ALONG
     for name in scene.parameter_names:
-        moved = scene.prescribed.per_unit.get(name)
-        if moved is None or moved[~own].any():
+        per_unit = scene.prescribed.per_unit.get(name)
+        if per_unit is None or per_unit[~at_support].any():
             continue
-        c = moved[own].mean(axis=0)
+        c = per_unit[at_support].mean(axis=0)
         if (along := abs(c @ np.asarray(force.direction)) / np.linalg.norm(c)) > most:
             best, most = name, along
     return best if best is not None and _rests(scene) else None
 
 
 def _rests(scene: Scene) -> bool:
-    """Return whether the body is in equilibrium as it lies."""
+    """Return whether the mesh is an equilibrium of the body without load."""
     if any(load.energy_density is None for load in scene.loads):
         return False
     with jax.ensure_compile_time_eval():
@@ -103,12 +103,12 @@ class SupportWork:
 
     @cached_property
     def _share(self) -> tuple[float, np.ndarray]:
-        """The factor alpha, and what is left of the virtual displacement at the support, (n, 3)."""
+        """The factor alpha, and the remaining virtual displacement at the support, (n, 3)."""
         nodes, d = self.force.support_nodes, np.asarray(self.force.direction)
-        moved = self.scene.prescribed.per_unit[self.amount]
-        c = moved[nodes].mean(axis=0)
-        alpha, left = float(d @ c / (c @ c)), np.zeros(moved.shape)
-        left[nodes] = np.where(self.scene.held[nodes], d - alpha * moved[nodes], 0.0)
+        per_unit = self.scene.prescribed.per_unit[self.amount]
+        c = per_unit[nodes].mean(axis=0)
+        alpha, left = float(d @ c / (c @ c)), np.zeros(per_unit.shape)
+        left[nodes] = np.where(self.scene.held[nodes], d - alpha * per_unit[nodes], 0.0)
         return alpha, left
 
     def _works(self, cells: _Cells, theta: jax.Array) -> jax.Array:
@@ -129,7 +129,7 @@ class SupportWork:
 
     @cached_property
     def _weighed(self) -> tuple[_Cells, np.ndarray]:
-        """The cells that stand for all, and their weights (c,)."""
+        """A small subset of cells, and their weights (c,), that integrates the support's work."""
         from scipy.optimize import nnls
 
         count = max(_FEWEST, _PER_PARAMETER * len(self.scene.parameters))
@@ -175,12 +175,12 @@ class _Cells:
 
     @classmethod
     def of(cls, scene: Scene, forward: ForwardMap) -> _Cells:
-        """Return all of a scene's."""
+        """Return all quadrature points and springs of a scene."""
         springs = tuple(np.arange(len(term.nodes)) for term in spring_terms(scene))
         return cls(scene, forward, None, springs)
 
     def only(self, chosen: np.ndarray) -> _Cells:
-        """Return those of all that have these numbers, ascending, with the map of their nodes."""
+        """Return the cells with these numbers, ascending, with the forward map of their nodes."""
         ends = np.cumsum([self.scene.blocks.weights.size, *(len(rows) for rows in self.springs)])
         parts = np.split(chosen, np.searchsorted(chosen, ends))[:-1]
         points, *springs = (part - start for part, start in zip(parts, [0, *ends], strict=False))
@@ -210,6 +210,6 @@ class _Cells:
         energies = [elastic.ravel()]
         for term, groups in zip(spring_terms(scene), self.springs, strict=True):
             data = jax.tree.map(lambda array: array[groups], term.data)  # noqa: B023 - used at once
-            own = replace(term, nodes=number[term.nodes[groups]], data=data)
-            energies.append(own.energies(u, values))
+            local_term = replace(term, nodes=number[term.nodes[groups]], data=data)
+            energies.append(local_term.energies(u, values))
         return jnp.concatenate(energies)

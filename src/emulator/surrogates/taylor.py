@@ -78,7 +78,7 @@ class Expansion(ArrayPart):
         return CachedPart(offset, modes, self.monomials)
 
     def less(self, part: CachedPart) -> Expansion:
-        """Return the series less ``part``'s series about the same centre, over all nodes.
+        """Subtract the series of ``part`` about this centre, over all nodes.
 
         Added to the part, it has the same derivatives there as FEM.
         """
@@ -172,10 +172,10 @@ def expand_at(
         if comb(count + degree - 1, degree) > _MOST_TERMS:
             break
         terms = list(combinations_with_replacement(range(count), degree))
-        for k, each in enumerate(chain):
-            system = each.system
+        for k, equations in enumerate(chain):
+            system = equations.system
             forces, prescribed = _forces(chain[: k + 1], position, terms, known)
-            free = -jax.jit(system.solve)(each.tangent, forces.T)
+            free = -jax.jit(system.solve)(equations.tangent, forces.T)
             derivatives = jax.vmap(system.extend, in_axes=1)(free) + prescribed
             if not jnp.isfinite(derivatives).all():
                 raise SolverError(
@@ -185,7 +185,7 @@ def expand_at(
     if not known[0]:
         return constant(np.asarray(position), u)
     indices = np.array([[*term, *(-1,) * (order - len(term))] for term in known[0]])
-    total = sum(jnp.stack(list(each.values())) for each in known)
+    total = sum(jnp.stack(list(h.values())) for h in known)
     return Expansion(np.asarray(position), u, indices, jnp.asarray(total))
 
 
@@ -207,7 +207,7 @@ def _forces(
     # displacements also one for the full multi-index.
     proper = [s for size in range(1, degree) for s in combinations(range(degree), size)]
     with_full_index = [*proper, tuple(range(degree))]
-    subsets = [with_full_index if each is not last else proper for each in chain]
+    subsets = [with_full_index if equations is not last else proper for equations in chain]
     paths = [_places(terms, parts, here) for parts, here in zip(subsets, known, strict=False)]
     nothing = jnp.zeros((0, *last.u.shape))
     fields = [jnp.stack(list(h.values())) if h else nothing for h in known[: len(chain)]]
@@ -220,8 +220,8 @@ def _forces(
 
         def along(*steps: jax.Array) -> tuple[jax.Array, jax.Array]:
             displacements = []
-            for each, parts, path, values in zip(chain, subsets, paths, fields, strict=True):
-                v = each.u
+            for equations, parts, path, values in zip(chain, subsets, paths, fields, strict=True):
+                v = equations.u
                 for part, place in zip(parts, path, strict=True):
                     v = v + prod((steps[k] for k in part), start=jnp.ones(())) * values[place]
                 displacements.append(v)
@@ -235,7 +235,7 @@ def _forces(
         return _mixed_derivative(along, degree)()
 
     directions = jnp.stack([jnp.eye(len(position))[jnp.array(term)] for term in terms])
-    return jax.jit(lambda d, p, k: jax.lax.map(lambda each: one(each, k), (d, p)))(
+    return jax.jit(lambda d, p, k: jax.lax.map(lambda argument: one(argument, k), (d, p)))(
         directions, paths, fields
     )
 

@@ -176,8 +176,8 @@ def family_on(scene: Scene, start: Emulator) -> Emulator:
 def anchored(network: Emulator, series: Expansion) -> Emulator:
     """Return the network of a family made to have the derivatives of ``series`` at its centre."""
     assert network.family is not None, "the network is of a family"
-    own = network.family.cache(all_nodes(network.scene))
-    return replace(network, taylor=series.less(own).rounded())
+    family_map = network.family.cache(all_nodes(network.scene))
+    return replace(network, taylor=series.less(family_map).rounded())
 
 
 def of_position(emulator: Emulator) -> Callable[[jax.Array], jax.Array]:
@@ -189,5 +189,5 @@ def of_position(emulator: Emulator) -> Callable[[jax.Array], jax.Array]:
 def _error(emulator: Emulator, runs: Runs) -> float:
     """Return the geometric mean of err_u over ``runs``, mm, so that no single error decides."""
     predicted = jax.jit(emulator.cache())(runs.theta)
-    each = jnp.mean(jnp.linalg.norm(predicted - runs.displacement, axis=-1), axis=-1)
-    return float(jnp.exp(jnp.mean(jnp.log(each + 1e-300))))
+    errors = jnp.mean(jnp.linalg.norm(predicted - runs.displacement, axis=-1), axis=-1)
+    return float(jnp.exp(jnp.mean(jnp.log(errors + 1e-300))))

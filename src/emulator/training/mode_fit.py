@@ -78,14 +78,14 @@ class BranchTargets(NamedTuple):
     slopes: jax.Array
     products: jax.Array
 
-    def misfit(self, found: jax.Array, wanted: jax.Array) -> jax.Array:
-        """Return the square of ``found`` less ``wanted`` (s, r), over that of ``wanted``, ()."""
+    def misfit(self, coefficients: jax.Array, wanted: jax.Array) -> jax.Array:
+        """Return the squared distance of coefficients (s, r) to ``wanted``, over its square, ()."""
         square = lambda e: jnp.sum((e @ self.products) * e)  # noqa: E731
-        return square(found - wanted) / square(wanted)
+        return square(coefficients - wanted) / square(wanted)
 
 
 class Scales(NamedTuple):
-    """Root mean squares of what runs differ by from the centre's: s, mm, and s_F, dimensionless."""
+    """Root mean square differences of runs from the centre's: s, mm, and s_F, dimensionless."""
 
     displacement: float
     gradient: float
@@ -209,8 +209,8 @@ class ModeFit:
 
     def _with_last_layer(self, weights: Weights, W: jax.Array, *, branch: bool = False) -> Weights:
         """Return ``weights`` with W (h, ...) as the last layer of the trunk, or of the branch."""
-        own = jax.tree.map(lambda w: w, weights)  # not the caller's variables
-        network = nnx.merge(self.network.definition, own)
+        copy = jax.tree.map(lambda w: w, weights)  # not the caller's variables
+        network = nnx.merge(self.network.definition, copy)
         last = (network.decoder.branch if branch else network.decoder.trunk).layers[-1]
         flat = W.reshape(len(W), -1).astype(jnp.float32)
         last.kernel.set_value(flat[:-1])
@@ -246,7 +246,7 @@ class ModeFit:
         return BranchTargets(coefficients(deviations), coefficients(slopes), jnp.asarray(products))
 
     def _branch_rows(self, branch: MLP, targets: BranchTargets) -> tuple[jax.Array, jax.Array]:
-        """Return h (s, h) and what h B is to be (s, r): values, then slopes by their weight."""
+        """Return h (s, h) and the targets of h B (s, r): values, then weighted slopes."""
 
         def hidden(position: jax.Array) -> jax.Array:
             return jnp.append(branch.hidden(self.network.normalise(position)), 1.0)

@@ -1,4 +1,4 @@
-"""What all recipes have in common: their options, and what a training is given.
+"""The options that all recipes have, and the inputs of a training.
 
 A recipe is a frozen dataclass of its options with a method that trains an emulator, in a file of
 its own; all of them are listed in :mod:`emulator.training.trainer`.
@@ -68,11 +68,11 @@ class Plan:
         return hasattr(self, "steps")
 
     def with_counts(self, **counts: int) -> Self:
-        """Return the plan with the ``simulations``, ``steps`` or ``sweeps`` that were really done.
+        """Return the plan with the numbers of ``simulations``, ``steps`` or ``sweeps`` done.
 
         Counts that the recipe does not have are left out.
         """
-        names = {each.name for each in fields(self)}
+        names = {option.name for option in fields(self)}
         own_counts: dict[str, Any] = {name: n for name, n in counts.items() if name in names}
         return replace(self, **own_counts)
 

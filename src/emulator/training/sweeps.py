@@ -194,7 +194,7 @@ def sweep_box(
 
 
 def check_sweeps(scene: Scene, sweeps: int, *, at_rest: bool) -> None:
-    """Raise :class:`InputError` for what cannot be swept.
+    """Raise :class:`InputError` for a scene that cannot be swept.
 
     A load of the scene has no potential, or sweeps from rest are too few for the loads to rise.
     """
@@ -223,7 +223,7 @@ def _initial_state(
     lost: int,
     beneath: Map | None = None,
 ) -> SweepState:
-    """Return the state before the first sweep; its polynomial is fitted to start ``lost``, if any.
+    """Return the state before the first sweep; its polynomial is fitted to ``lost``, if any.
 
     A start that is not finite, or that FEM finds no solution for, is left for the next.
     """
@@ -256,7 +256,7 @@ def _free_fields(simulator: Simulator, displacement: Map, position: np.ndarray) 
 def _sweep(
     simulator: Simulator, state: SweepState, seed: int, beneath: Map | None
 ) -> tuple[SweepState, dict[str, Any]]:
-    """Return the state after one sweep, and what the progress bar shows of it."""
+    """Return the state after one sweep, and the numbers that the progress bar shows."""
     from scipy.stats import qmc  # slow to import, and only for sweeps
 
     parameters, count = len(simulator.scene.parameters), _FEWEST
@@ -331,11 +331,11 @@ def runs_of(simulator: Simulator, state: SweepState, thetas: jax.Array) -> Runs:
         v = legendre(scene.to_unit(theta), degrees) @ coefficients
         return scene.on_supports(system.extend(v), theta)
 
-    def each(theta: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def run_at(theta: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         u, slopes = displacement(theta), jax.jacfwd(displacement)(theta)
         return u, system.potential(u, theta)[0], jnp.moveaxis(slopes, -1, 0)
 
-    return Runs(thetas, *compiled(lambda t: jax.lax.map(each, t))(thetas))
+    return Runs(thetas, *compiled(lambda t: jax.lax.map(run_at, t))(thetas))
 
 
 def _write(folder: Path, state: SweepState) -> None:

@@ -74,8 +74,8 @@ def targets(
         for middle in rows[:_MIDDLES]:
             tangent, definite = _tangent(system, fields[middle], thetas[middle], load)
             if bool(definite):
-                each = [_target(system, tangent, fields[k], thetas[k], load) for k in rows]
-                return jax.tree.map(lambda *numbers: np.stack(numbers), *each)
+                group_targets = [_target(system, tangent, fields[k], thetas[k], load) for k in rows]
+                return jax.tree.map(lambda *numbers: np.stack(numbers), *group_targets)
         nothing = np.zeros(len(rows))
         return Targets(fields[rows], nothing + np.inf, nothing, nothing, nothing + np.inf)
 

@@ -94,7 +94,7 @@ def train(
         )
     session = Session(folder / CHECKPOINT, scene.fingerprint, plan, architecture)
     if resume:
-        kinds = {name: type(each) for name, each in RECIPES.items()}
+        kinds = {name: type(default) for name, default in RECIPES.items()}
         session, budget = session.resumed(scene.name, kinds), None  # the checkpoint has the budget
     seconds = np.inf if budget is None else budget
     sizes = session.architecture

@@ -33,8 +33,8 @@ def pulled(law: str, stretches: Sequence[float], values: Values | None = None) -
 
     Its parameter is the law's first one; the others are constants.
     """
-    given = SOLUTIONS[law][1] if values is None else values
-    (name, value), *fixed = given.items()
+    numbers = SOLUTIONS[law][1] if values is None else values
+    (name, value), *fixed = numbers.items()
     description, free = find_law(law), [np.nan] * len(stretches)
     return specimen(
         {"stretch_x": np.tile(stretches, 2), "stretch_y": np.array([*free, *stretches])},

@@ -97,7 +97,7 @@ def verify_cook() -> list[Benchmark]:
         ("Cook, mean dilatation: nu 0.49999 over nu 0.4999", stiffer / stiff, 1.0, 1e-3, _FREE),
     ]
     for nu in (0.499, 0.4999):
-        order = order_of(*(deflection(each, nu) for each in mean.values()))
+        order = order_of(*(deflection(simulator, nu) for simulator in mean.values()))
         name = f"Cook, nu {nu:g}, mean dilatation: order of convergence"
         rows.append((name, order, 2.2, 0.5, _COOK_ORDER))
     name = "Cook, nu 0.4999, P1 with parallel diagonals: share of the deflection"
@@ -160,7 +160,7 @@ def verify_sphere() -> list[Benchmark]:
         rows.append(Benchmark(name, measured, stretch, 0.005 * stretch, _SOURCE))
     nested = [Simulator(sphere_scene((n, n))) for n in (2, 4, 8)]
     for nu in (0.499, NU):
-        order = order_of(*(inner_stretch(each, STRETCH, nu) for each in nested))
+        order = order_of(*(inner_stretch(simulator, STRETCH, nu) for simulator in nested))
         name = f"thick sphere, nu {nu:g}: order of convergence"
         rows.append(Benchmark(name, order, 3.7, 0.5, _ORDER))
     return rows + verify_pressure_work()

@@ -22,7 +22,7 @@ def test_loads_and_noise_are_a_member_s_own(ventricle):
     material = [n for n in ventricle.parameter_names if n not in ventricle.load_parameters]
     assert ventricle.load_parameters == ("pressure",)
     assert list(found.shared) == material
-    assert found.own == {"one": ("pressure",), "two": ("pressure@p4", "pressure@p8")}
+    assert found.unshared == {"one": ("pressure",), "two": ("pressure@p4", "pressure@p8")}
     assert list(population_model({"one": one}, shared=("pressure",)).shared) == ["pressure"]
 
 

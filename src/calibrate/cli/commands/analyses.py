@@ -1,4 +1,4 @@
-"""``calibrate identify``, ``effects`` and ``sensitivity``: what data determine, what matters."""
+"""``calibrate identify``, ``effects`` and ``sensitivity``: analyses of a model and its data."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @command(run_options("seed"), help="of data not yet measured, from a scene")
 def _before(arguments: Namespace) -> Answer:
-    """Find what the observations would determine."""
+    """Find the parameters that the observations would determine."""
     from calibrate.analysis.expected import expected_precision
     from calibrate.analysis.identifiability import products_in_words
     from calibrate.cli.run_words import problem_of
@@ -53,7 +53,7 @@ def _before(arguments: Namespace) -> Answer:
     help="of a posterior that calibrate infer wrote",
 )
 def _after(arguments: Namespace) -> Answer:
-    """Find what a posterior's data determined, and which measurement would add most."""
+    """Find the parameters that data determined, and the measurement that would add most."""
     from calibrate.analysis.expected import next_measurement
     from calibrate.analysis.identifiability import (
         identify,
@@ -147,7 +147,7 @@ def effects(arguments: Namespace) -> Answer:
         "tolerance": recommendation.tolerance,
         "units": recommendation.units,
         "whole": vars(recommendation.whole),
-        "alone": [vars(each) for each in recommendation.alone],
+        "alone": [vars(effect) for effect in recommendation.alone],
         "chosen": vars(recommendation.chosen),
     }
     return Answer(result, _effects_in_words(recommendation))
@@ -158,12 +158,12 @@ def _effects_in_words(recommendation: Recommendation) -> str:
     observed = [f"{name}, {unit}" for name, unit in recommendation.units.items()]
     rows = [
         (
-            ", ".join(each.left_out),
-            *(each.changes[name] for name in recommendation.units),
-            f"{each.ratio:.2f} x",
-            each.unknowns,
+            ", ".join(effect.left_out),
+            *(effect.changes[name] for name in recommendation.units),
+            f"{effect.ratio:.2f} x",
+            effect.unknowns,
         )
-        for each in recommendation.alone
+        for effect in recommendation.alone
     ]
     whole = recommendation.whole
     lines = [
@@ -199,18 +199,18 @@ def terms(arguments: Namespace) -> Answer:
     from calibrate.cli.run_words import problem_of
     from calibrate.project.problem import build_model, with_data
 
-    found = find_terms(*build_model(with_data(problem_of(arguments))))
+    comparison = find_terms(*build_model(with_data(problem_of(arguments))))
     columns: list[list[str]] = [
-        [", ".join(names) or "none" for names, _ in found.sets],
-        [f"{chance:.3f}" for _, chance in found.sets],
+        [", ".join(names) or "none" for names, _ in comparison.sets],
+        [f"{chance:.3f}" for _, chance in comparison.sets],
     ]
     head, tables = ["likeliest sets", "probability"], list[str]()
-    if found.held_out:
+    if comparison.held_out:
         head.append("log density of a held-out point")
-        columns.append([f"{x:.2f}" for x in found.log_densities])
-        tables = [table(HeldOut.head, (each.cells for each in found.held_out))]
+        columns.append([f"{x:.2f}" for x in comparison.log_densities])
+        tables = [table(HeldOut.head, (test.cells for test in comparison.held_out))]
     sets = table(head, zip(*columns, strict=True))
-    return Answer(asdict(found), "\n\n".join([str(found), sets, *tables]))
+    return Answer(asdict(comparison), "\n\n".join([str(comparison), sets, *tables]))
 
 
 _SAMPLES = {"sobol": 512, "morris": 64, "derivatives": 256}

@@ -97,8 +97,8 @@ def _prior(arguments: Namespace) -> Answer:
     problem = problem_of(arguments)
     run, model = problem.run, model_before_data(problem, progress=not arguments.json)
     replicates = prior_replicates(model, jax.random.key(run.seed))
-    fewer = shortfall(found := len(replicates.draws[model.names[0]]))
-    if not found:
+    fewer = shortfall(count := len(replicates.draws[model.names[0]]))
+    if not count:
         raise InputError(fewer[0])
     units = {name: part.unit for name, part in model.observe.parts.items()}
     save_arrays(folder / "prior_predictive.safetensors", {**replicates.draws, **replicates.data})

@@ -171,7 +171,7 @@ def evaluate(arguments: Namespace) -> Answer:
 
         path = Path(arguments.out) / "evaluation.json"
         write_json(path, evaluated.report)
-        report["files"] = [str(each) for each in (path, *draw(evaluated, arguments.out))]
+        report["files"] = [str(file) for file in (path, *draw(evaluated, arguments.out))]
         text += f"\nwritten: {', '.join(report['files'])}"
     return Answer(report, text)
 

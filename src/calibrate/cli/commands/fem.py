@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def _solved(scene: Scene, theta: Any, solution: Solution | Unloaded) -> tuple[dict[str, Any], str]:
-    """Return what a solve came to, as plain JSON and in a line."""
+    """Return the outcome of a solve, as plain JSON and in a line."""
     from emulator.fem import Status
 
     status = Status(int(solution.status))
@@ -146,8 +146,8 @@ def unload(arguments: Namespace) -> Answer:
     result |= {
         "largest_displacement": float(np.linalg.norm(unloaded.displacement, axis=1).max()),
         "volumes": {
-            name: {"loaded_ml": each["rest_ml"], "unloaded_ml": each["volume_ml"]}
-            for name, each in volumes(scene, unloaded.displacement).items()
+            name: {"loaded_ml": volume["rest_ml"], "unloaded_ml": volume["volume_ml"]}
+            for name, volume in volumes(scene, unloaded.displacement).items()
         },
         "reloaded": {
             "status": status.name.lower(),
@@ -157,8 +157,8 @@ def unload(arguments: Namespace) -> Answer:
     }
     lines = [line, f"largest displacement {result['largest_displacement']:.6g} mm"]
     lines += [
-        f"cavity '{name}': {each['unloaded_ml']:.6g} mL, under load {each['loaded_ml']:.6g} mL"
-        for name, each in result["volumes"].items()
+        f"cavity '{name}': {volume['unloaded_ml']:.6g} mL, under load {volume['loaded_ml']:.6g} mL"
+        for name, volume in result["volumes"].items()
     ]
     lines.append(
         f"loaded again from rest: {status.text}, residual {reloaded.residual:.1e}, "
@@ -209,7 +209,7 @@ def _add_design(parser: ArgumentParser) -> None:
     "calibrate train left_ventricle --campaign runs.zarr --out emulator",
 )
 def campaign(arguments: Namespace) -> Answer:
-    """Solve what the store lacks, and count rows by their status."""
+    """Solve the rows that the store lacks, and count rows by their status."""
     from calibrate.project.campaigns import fill, question
     from emulator.fem import NewtonOptions
     from emulator.fem.campaign.store import count_statuses

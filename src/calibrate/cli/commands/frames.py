@@ -110,14 +110,14 @@ def _full_field(arguments: Namespace) -> Answer:
     amounts = read_amounts(path, column)
     sign = sign_of(scene, parameter, amounts)
     amounts = {frame: sign * amount for frame, amount in amounts.items()}
-    moved = [frame for frame in field.frames if amounts.get(frame) != 0.0]
+    loaded_frames = [frame for frame in field.frames if amounts.get(frame) != 0.0]
     count = min(arguments.points, len(field.points))
-    field = field.only(arguments.only or moved, spread_points(field.points, count))
+    field = field.only(arguments.only or loaded_frames, spread_points(field.points, count))
     observe, data = field_data(scene, field, amounts)
     parts = dict(observe.parts)
-    for each in arguments.force:
+    for curve in arguments.force:
         usage = "REACTION=FILE:AMOUNT:COLUMN"
-        word, path, *columns = _split(each, "--force", usage)
+        word, path, *columns = _split(curve, "--force", usage)
         at, force = read_curve(path, columns[0], columns[1], list(amounts.values()))
         ((name, part),) = parse_observation(scene, word, 0).parts.items()
         if in_state(name, field.frames[0]) in parts:
@@ -145,7 +145,7 @@ def _split(word: str, flag: str, usage: str) -> list[str]:
 
 
 def _measured(data: Mapping[str, Any], out: str) -> Answer:
-    """Return a table of what was measured."""
+    """Return a table of the measured data."""
     import numpy as np
 
     rows, result = [], {}
@@ -158,5 +158,5 @@ def _measured(data: Mapping[str, Any], out: str) -> Answer:
         }
         result[name] = of
         rows.append((name, f"{of['mean']:.4g}", f"{of['sd']:.3g}", of["missing"]))
-    told = table(("data", "mean (mm, mL, N)", "sd", "missing"), rows)
-    return Answer({"out": out, "data": result}, f"{told}\nwritten to {out}")
+    text = table(("data", "mean (mm, mL, N)", "sd", "missing"), rows)
+    return Answer({"out": out, "data": result}, f"{text}\nwritten to {out}")

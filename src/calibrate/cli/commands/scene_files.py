@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     epilog="example: calibrate init ventricle.msh, then calibrate simulate ventricle.toml",
 )
 def init(arguments: Namespace) -> Answer:
-    """Write the scene file, and say what the mesh has."""
+    """Write the scene file, and describe the mesh."""
     from emulator.core.cells import SPREADSHEETS, TEXT
     from emulator.scenes.draft import draft_scene
 
@@ -75,7 +75,7 @@ def init(arguments: Namespace) -> Answer:
 
 
 def _init_specimen(table_path: Path, out: str | Path, arguments: Namespace) -> Answer:
-    """Write the files for a table, and say what was guessed."""
+    """Write the files for a table, and list the guesses."""
     from calibrate.project.specimen import draft_specimen
     from emulator.scenes.specimen import measured_states
 
@@ -197,11 +197,11 @@ def mesh(arguments: Namespace) -> Answer:
         "base": wall.base,
         "thickness": wall.thickness._asdict(),
         "cavities": {
-            name: dict(zip(names, own, strict=True)) for name, own in wall.cavities.items()
+            name: dict(zip(names, volumes, strict=True)) for name, volumes in wall.cavities.items()
         },
         "wall": dict(zip(names, wall.wall, strict=True)),
         **dict(zip(("cut_off", "cut_off_ml"), wall.cut_off, strict=True)),
-        "moved": wall.moved,
+        "moved": wall.shift,
         "folded": wall.folded[0],
         "warnings": list(wall.warnings),
         "quality": wall.quality._asdict(),
@@ -233,7 +233,7 @@ def scenes(arguments: Namespace) -> Answer:  # noqa: ARG001
     rows: list[dict[str, Any]] = []
     for name, make in sorted(BUILT_IN.items()):
         scene = make()
-        own = [emulator for emulator, origin in origins.items() if origin.get("scene") == name]
+        emulators = [n for n, origin in origins.items() if origin.get("scene") == name]
         rows.append(
             {
                 "name": name,
@@ -244,8 +244,8 @@ def scenes(arguments: Namespace) -> Answer:  # noqa: ARG001
                     {"name": p.name, "unit": p.unit, "low": p.low, "high": p.high, "scale": p.scale}
                     for p in scene.parameters
                 ],
-                "emulator_shipped": name in own,
-                "emulators": own,
+                "emulator_shipped": name in emulators,
+                "emulators": emulators,
             }
         )
     return Answer(rows, _scenes_in_words(rows))
@@ -267,7 +267,7 @@ def _scenes_in_words(rows: list[dict[str, Any]]) -> str:
 
 def _wrapped(name: str, entries: list[str]) -> list[str]:
     """Return ``entries`` after ``name``, on lines that fit a terminal, no entry on two."""
-    indent, joined = f"  {name}  ", ", ".join(each.replace(" ", "\0") for each in entries)
+    indent, joined = f"  {name}  ", ", ".join(entry.replace(" ", "\0") for entry in entries)
     rest = " " * len(indent)
     lines = textwrap.wrap(joined, _WIDTH, initial_indent=indent, subsequent_indent=rest)
     return [line.replace("\0", " ") for line in lines]

@@ -99,7 +99,7 @@ def serve(arguments: Namespace) -> Answer:
     ]
     names = list(scene.parameter_names)
     result = {"address": address, "name": NAME, "input": names, "output": outputs}
-    numbers = ", ".join("{name} ({numbers}, {unit})".format_map(each) for each in outputs)
+    numbers = ", ".join("{name} ({numbers}, {unit})".format_map(output) for output in outputs)
     text = (
         f"{address}, model '{NAME}': {model.label} of {scene.name}\n"
         f"input: {', '.join(names)}\noutput: {numbers}\nCtrl-C ends it"

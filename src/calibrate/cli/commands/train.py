@@ -122,7 +122,7 @@ def train(arguments: Namespace) -> Answer:
 
 
 def _train_grips(scene: Scene, arguments: Namespace) -> Answer:
-    """Learn and write what the grips of a specimen add to its stresses."""
+    """Train and write the model of the stresses that the grips of a specimen add."""
     from emulator.surrogates.gripped import RUNS, learn_grips
 
     out = Path(arguments.out)
@@ -163,20 +163,20 @@ def _training_summary(folder: str, scene: str, record: Mapping[str, Any]) -> str
     if error is None:
         return f"{text}; errors of forces, volumes and strains: calibrate evaluate {folder}"
     text += f"; {error:.2g} mm from FEM at held-out runs"
-    told = choice.get("held_out", {})
-    of = f"N of up to {told.get('max_R', {}).get('max', 0.0):.2g} N in the force of a support"
+    held_out = choice.get("held_out", {})
+    of = f"N of up to {held_out.get('max_R', {}).get('max', 0.0):.2g} N in the force of a support"
     words = {"err_R": of, "err_V": "% of a cavity", "err_E": "in strain"}
-    worst = [f"{told[name]['max']:.2g} {what}" for name, what in words.items() if name in told]
+    worst = [f"{held_out[n]['max']:.2g} {what}" for n, what in words.items() if n in held_out]
     return f"{text}, at worst {', '.join(worst)}" if worst else text
 
 
 def _plan_entries(arguments: Namespace) -> dict[str, Any]:
     """Return the plan's fields from the command line; ``--resume`` allows none."""
     names = (*_ENTRIES, "recipe", "budget")
-    given = [name for name in names if getattr(arguments, name) is not None]
-    if arguments.resume and given:
-        raise InputError(f"--{given[0]} has no effect with --resume: the checkpoint has its plan")
-    return {name: getattr(arguments, name) for name in given if name in _ENTRIES}
+    options = [name for name in names if getattr(arguments, name) is not None]
+    if arguments.resume and options:
+        raise InputError(f"--{options[0]} has no effect with --resume: the checkpoint has its plan")
+    return {name: getattr(arguments, name) for name in options if name in _ENTRIES}
 
 
 def _plan(name: str, entries: Mapping[str, Any], budget: str | None) -> Plan:
@@ -187,7 +187,7 @@ def _plan(name: str, entries: Mapping[str, Any], budget: str | None) -> Plan:
     from emulator.training import recipe
 
     plan: Plan = recipe(name)
-    names = {each.name for each in fields(plan)}
+    names = {option.name for option in fields(plan)}
     if "steps" not in names and entries.get("steps") == 0:
         entries = {word: value for word, value in entries.items() if word != "steps"}
     plan = replace(plan, **{word: value for word, value in entries.items() if word in names})
@@ -203,7 +203,7 @@ def _plan(name: str, entries: Mapping[str, Any], budget: str | None) -> Plan:
 
 def _unused(plan: Plan) -> dict[str, str]:
     """Return the options that change nothing under ``plan``, and why."""
-    names = {each.name for each in fields(plan)}
+    names = {option.name for option in fields(plan)}
     network = (
         "learns from all equilibria at every step" if plan.trains_network else "trains no network"
     )

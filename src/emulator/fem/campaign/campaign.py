@@ -51,8 +51,8 @@ def solve_together(simulator: Simulator, thetas: jax.Array) -> Solution:
     return _stacked([row.solution for row in rows])
 
 
-def _stacked[Fields](each: Sequence[Fields]) -> Fields:
-    stacked: Fields = jax.tree.map(lambda *fields: jnp.stack(fields), *each)
+def _stacked[Fields](rows: Sequence[Fields]) -> Fields:
+    stacked: Fields = jax.tree.map(lambda *fields: jnp.stack(fields), *rows)
     return stacked
 
 

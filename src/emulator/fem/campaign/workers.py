@@ -143,7 +143,7 @@ def _best(system: System, starts: jax.Array, theta: jax.Array) -> jax.Array:
 
 # ---- many solves ---------------------------------------------------------------------------------
 def at_once(simulator: Simulator, nodes: int | None = None) -> int:
-    """Return how many solves this machine does at once, limited by its cores and its memory.
+    """Return the number of concurrent solves, limited by the machine's cores and memory.
 
     It is 1 on large meshes, where a factor is kept between solves, and
     for a simulator of another class: only FEM simulators of this package are known to be
@@ -153,8 +153,8 @@ def at_once(simulator: Simulator, nodes: int | None = None) -> int:
     """
     if not isinstance(simulator, Simulator) or simulator.stepwise:
         return 1
-    each = _BYTES_A_NODE * (nodes or len(simulator.scene.mesh.nodes))
-    return max(1, int(min(cores(), _MEMORY_SHARE * memory() / each)))
+    bytes_per_solve = _BYTES_A_NODE * (nodes or len(simulator.scene.mesh.nodes))
+    return max(1, int(min(cores(), _MEMORY_SHARE * memory() / bytes_per_solve)))
 
 
 def in_order[T, R](function: Callable[[T], R], tasks: Iterator[T], workers: int) -> Iterator[R]:

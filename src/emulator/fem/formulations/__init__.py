@@ -17,7 +17,7 @@ FORMULATIONS: dict[str, type[Displacement]] = {
 
 def formulation_of(system: System) -> Displacement:
     """Return the formulation by which Newton's method solves the equations of ``system``."""
-    serving = (each for each in FORMULATIONS.values() if each.serves(system))
+    serving = (formulation for formulation in FORMULATIONS.values() if formulation.serves(system))
     return next(serving)(system)
 
 

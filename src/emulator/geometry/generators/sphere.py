@@ -65,7 +65,7 @@ def _icosahedron() -> tuple[np.ndarray, np.ndarray]:
     half = np.array([(0.0, a, b * golden) for a in (-1.0, 1.0) for b in (-1.0, 1.0)])
     corners = unit(np.concatenate([np.roll(half, turn, axis=1) for turn in range(3)]))
     adjacent = corners @ corners.T > 0.4  # neighbours' directions have cosine 1 / sqrt(5)
-    faces = [each for each in combinations(range(12), 3) if adjacent[np.ix_(each, each)].all()]
+    faces = [row for row in combinations(range(12), 3) if adjacent[np.ix_(row, row)].all()]
     return corners, np.array(faces)
 
 

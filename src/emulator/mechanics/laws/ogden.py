@@ -70,7 +70,7 @@ def _doubled(pair: Pair) -> Pair:
 
 
 def _halved(pair: Pair) -> Pair:
-    """Return the pair of the square root: x, y with ``_doubled((x, y)) == pair``."""
+    """Return the traces (x, y) of the matrix square root: ``_doubled((x, y)) == pair``."""
     X, Y = pair
     fixed_X, fixed_Y = jax.lax.stop_gradient(pair)
     u, v = jnp.sqrt(9.0 + fixed_X), jnp.sqrt(9.0 + fixed_Y)  # traces, as if the other's were 3
@@ -78,8 +78,8 @@ def _halved(pair: Pair) -> Pair:
         u, v = jnp.sqrt(3.0 + fixed_X + 2.0 * v), jnp.sqrt(3.0 + fixed_Y + 2.0 * u)
     x, y = u - 3.0, v - 3.0
     for _ in range(_NEWTON):
-        found = _doubled((x, y))
-        a, b = X - found[0], Y - found[1]
+        traces = _doubled((x, y))
+        a, b = X - traces[0], Y - traces[1]
         slope_x, slope_y = 6.0 + 2.0 * x, 6.0 + 2.0 * y
         determinant = slope_x * slope_y - 4.0  # 32 or more
         x, y = x + (slope_y * a + 2.0 * b) / determinant, y + (2.0 * a + slope_x * b) / determinant

@@ -85,7 +85,7 @@ class Support(BoundaryCondition):
 
 
 def prescribe(mesh: Mesh, supports: Sequence[BoundaryCondition]) -> Prescribed:
-    """Return what all ``supports`` prescribe.
+    """Return the displacements that all ``supports`` prescribe.
 
     Raises
     ------
@@ -93,13 +93,13 @@ def prescribe(mesh: Mesh, supports: Sequence[BoundaryCondition]) -> Prescribed:
         Two supports prescribe different values at a node that they share.
     """
     components = np.zeros(mesh.nodes.shape, dtype=bool)
-    prescribed = [each for support in supports if (each := support.held(mesh)) is not None]
-    amounts = (None, *dict.fromkeys(each.amount for each in prescribed if each.amount))
+    prescribed = [held for support in supports if (held := support.held(mesh)) is not None]
+    amounts = (None, *dict.fromkeys(held.amount for held in prescribed if held.amount))
     totals = {amount: np.zeros(mesh.nodes.shape) for amount in amounts}
-    for where, nodes, displacement, axes, own in prescribed:
+    for where, nodes, displacement, axes, parameter in prescribed:
         for axis in axes:
             for amount, total in totals.items():
-                value = displacement[:, axis] if amount == own else np.zeros(len(nodes))
+                value = displacement[:, axis] if amount == parameter else np.zeros(len(nodes))
                 clash = np.flatnonzero(components[nodes, axis] & (total[nodes, axis] != value))
                 if len(clash):
                     node, times = nodes[clash[0]], f" times {amount}" if amount else ""

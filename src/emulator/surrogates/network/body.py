@@ -1,4 +1,4 @@
-r"""A ventricle as a network of a family is told of it: numbers and vectors that turn with the body.
+r"""Features of a ventricle for the network of a family: numbers, and vectors that turn with it.
 
 Features are products of the body's own vectors (:mod:`emulator.geometry.heart_wall`), of its fibres
 and of its linear responses to pressure (:mod:`emulator.fem.linear_response`); lengths are over the
@@ -48,7 +48,7 @@ VECTORS = 7 + RESPONSES
 
 
 class BodyFeatures(NamedTuple):
-    """A ventricle as the network of a family is told of it.
+    """The features of a ventricle that the network of a family reads.
 
     graph : the graph of the regions, its features before standardisation.
     local : the features of all nodes, (n, d).
@@ -75,10 +75,10 @@ class BodyFeatures(NamedTuple):
 
 
 def describe(scene: Scene) -> BodyFeatures:
-    """Return the ventricle of ``scene``.
+    """Return the features of the ventricle of ``scene``.
 
-    Refused are no fibres, no cavity under pressure or several, and what
-    :func:`~emulator.geometry.heart_wall.ventricle` refuses.
+    :class:`InputError` where the scene has no fibres, or not one cavity under pressure, and where
+    :func:`~emulator.geometry.heart_wall.ventricle` raises it.
     """
     if scene.fibres is None:
         raise InputError(f"scene '{scene.name}' has no fibres; this network was trained with them")
@@ -90,8 +90,8 @@ def describe(scene: Scene) -> BodyFeatures:
     cavity, mesh, grid = find_cavity(scene).facet_set, scene.mesh, scene.discretisation
     try:
         corners, parents = _corners(mesh)
-        own = np.flatnonzero(parents[:, 0] == parents[:, 1])
-        at_corners = ventricle(corners, cavity, scene.held.all(axis=1)[own])
+        corner_nodes = np.flatnonzero(parents[:, 0] == parents[:, 1])
+        at_corners = ventricle(corners, cavity, scene.held.all(axis=1)[corner_nodes])
         fibres = scene.fibres_at_points
         responses = linear_responses(grid, fibres, cavity, scene.held)
     except InputError as error:
@@ -195,7 +195,7 @@ def _numbers(body: Ventricle, grid: Discretisation, fibres: np.ndarray) -> dict[
 def _of_responses(
     mesh: Mesh, cavity: str, body: Ventricle, responses: np.ndarray, sizes: np.ndarray
 ) -> dict[str, float]:
-    """Return how much the body gives: logarithms of mean displacements and of volumes."""
+    """Return the body's compliance: logarithms of mean displacements and of volumes."""
     growth = pressure_force(mesh, mesh.nodes, cavity)
     volumes = np.einsum("ni,sni->s", growth, responses) / body.size**3
     response = {"response": float(np.log(sizes[0] / body.size))}
@@ -208,7 +208,7 @@ def _of_responses(
 
 
 def _places(body: Ventricle) -> np.ndarray:
-    """Return the features of the nodes' places, (n, 12)."""
+    """Return the features of the nodes' positions, (n, 12)."""
     n, x, lean = body.normal, body.across, body.lean
     return np.column_stack(
         [
@@ -231,7 +231,7 @@ def _places(body: Ventricle) -> np.ndarray:
 def _along(body: Ventricle, field: np.ndarray) -> np.ndarray:
     """Return the parts of ``field`` (n, 3) along normal, circumference and axis, (n, 3)."""
     directions = (body.normal, body.circumference, np.broadcast_to(body.axis, field.shape))
-    return np.column_stack([np.einsum("ni,ni->n", each, field) for each in directions])
+    return np.column_stack([np.einsum("ni,ni->n", direction, field) for direction in directions])
 
 
 def _products(body: Ventricle, tensors: np.ndarray) -> np.ndarray:
@@ -259,9 +259,9 @@ def _nodal_means(grid: Discretisation, tensors: np.ndarray, volume: np.ndarray) 
     elements = grid.connectivity
     to_nodes = from_quadrature_points(grid.mesh.order, NODES[: elements.shape[1]])
     volumes = grid.weights.sum(axis=1) / elements.shape[1]
-    each = np.einsum("aq,m,smqij->masij", to_nodes, volumes, tensors)
-    total = np.zeros((len(volume), *each.shape[2:]))
-    np.add.at(total, elements, each)
+    contributions = np.einsum("aq,m,smqij->masij", to_nodes, volumes, tensors)
+    total = np.zeros((len(volume), *contributions.shape[2:]))
+    np.add.at(total, elements, contributions)
     return (total / volume[:, None, None, None]).swapaxes(0, 1)
 
 

@@ -166,7 +166,7 @@ class FamilyEnsemble(NamedTuple):
     @property
     def widths(self) -> Widths:
         """The widths of the network's inputs."""
-        region, edge, local, numbers = (each.shape[1] for each in self.standard)
+        region, edge, local, numbers = (moments.shape[1] for moments in self.standard)
         return Widths(region, edge, local, numbers, len(self.parameters))
 
     @property
@@ -193,7 +193,7 @@ class FamilyNetwork:
 
     @cached_property
     def features(self) -> BodyFeatures:
-        """The body as a network is told of it."""
+        """The features of the body."""
         with jax.ensure_compile_time_eval():  # the first call may be inside a trace
             return describe(self.scene)
 
@@ -254,7 +254,7 @@ class FamilyNetwork:
         return named_leaves(
             {
                 "members": {
-                    str(k): nnx.to_pure_dict(each) for k, each in enumerate(learned.members)
+                    str(k): nnx.to_pure_dict(member) for k, member in enumerate(learned.members)
                 },
                 "standard": learned.standard._asdict(),
             }
@@ -282,14 +282,14 @@ class FamilyNetwork:
             members=(),
             standard=Standard(**{n: widened(a) for n, a in inside(arrays, "standard").items()}),
             scale=float(description["scale"]),
-            parameters=tuple(Parameter(**each) for each in description["parameters"]),
+            parameters=tuple(Parameter(**entry) for entry in description["parameters"]),
             pressure=description["pressure"],
             physics=description["physics"],
             shapes={name: (low, high) for name, (low, high) in description["shapes"].items()},
         )
         members: list[nnx.State] = []
-        while own := inside(arrays, f"members/{len(members)}"):
-            members.append(filled_state(learned.outline, own, "the family's network"))
+        while weights := inside(arrays, f"members/{len(members)}"):
+            members.append(filled_state(learned.outline, weights, "the family's network"))
         return cls(learned._replace(members=tuple(members)), scene)
 
     def on(self, scene: Scene) -> Self:
@@ -308,7 +308,7 @@ class FamilyNetwork:
 
 
 def physics_of(scene: Scene, parameters: tuple[Parameter, ...]) -> dict[str, Any]:
-    """Return what a network knows one of: the law, kinds of loads, springs, other constants."""
+    """Return the physics that a network is bound to: law, kinds of loads, springs, constants."""
     names = {parameter.name for parameter in parameters}
     description = scene.identity.description
     constants = {n: v for n, v in description["constants"].items() if n not in names}
@@ -325,10 +325,10 @@ def physics_of(scene: Scene, parameters: tuple[Parameter, ...]) -> dict[str, Any
 
 
 def _check_physics(learned: FamilyEnsemble, scene: Scene) -> None:
-    """Refuse a scene of other physics, or of a theta that no training reached."""
+    """Raise :class:`InputError` for other physics, or a range of theta outside the training's."""
     trained = {parameter.name: parameter for parameter in learned.parameters}
     ranges = {name: (value, value, "") for name, value in scene.constants.items()}
-    ranges |= {each.name: (each.low, each.high, each.unit) for each in scene.parameters}
+    ranges |= {p.name: (p.low, p.high, p.unit) for p in scene.parameters}
     known, varied = set(trained), {parameter.name for parameter in scene.parameters}
     if not varied <= known or not known <= set(ranges):
         raise InputError(

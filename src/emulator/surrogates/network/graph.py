@@ -77,10 +77,10 @@ class Coarsenings:
 
     def extend(self, values: np.ndarray) -> np.ndarray:
         """Return ``values`` (n, d) of the mesh nodes and their means over clusters, (N, d)."""
-        each = [values]
+        layers = [values]
         for parent in self.parents:
-            each.append(cluster_means(each[-1], parent, int(parent.max()) + 1))
-        return np.concatenate(each)
+            layers.append(cluster_means(layers[-1], parent, int(parent.max()) + 1))
+        return np.concatenate(layers)
 
 
 def hierarchy(positions: np.ndarray, edges: np.ndarray) -> Coarsenings:
@@ -102,7 +102,7 @@ def hierarchy(positions: np.ndarray, edges: np.ndarray) -> Coarsenings:
 
 
 def clusters(positions: np.ndarray, count: int, weights: np.ndarray | None = None) -> np.ndarray:
-    """Return which of ``count`` clusters each of the ``positions`` (n, 3) lies in, (n,).
+    """Return the cluster, of ``count``, that each of the ``positions`` (n, 3) lies in, (n,).
 
     weights : of the positions, (n,); equal by default.
     """
