@@ -48,6 +48,7 @@ from jax.flatten_util import ravel_pytree
 from calibrate.noise.protocol import Scale
 from emulator.core.errors import InputError
 from emulator.core.gaussian_process import kernel_mean
+from emulator.core.small_matrices import eliminate
 from emulator.surrogates.protocol import fingerprint_of
 
 Means = Mapping[str, jax.Array]
