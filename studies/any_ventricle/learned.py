@@ -7,12 +7,12 @@ import numpy as np
 from flax import nnx
 from studies.any_ventricle.training import BodyRuns
 
-from emulator.surrogates.network.family import Learned
+from emulator.surrogates.network.family import FamilyEnsemble
 
 _LOADED = 0.33  # position in the box from which a pressure counts as one of diastole
 
 
-def error_of(learned: Learned, runs: BodyRuns) -> float:
+def error_of(learned: FamilyEnsemble, runs: BodyRuns) -> float:
     """The median over nodes and runs under a diastole's pressure of \\|u - u_FEM\\|, mm."""
     definition, _ = nnx.split(learned.outline)
     body = learned.standard.of(runs.features)

@@ -36,10 +36,10 @@ from emulator.scenes.scene import Scene
 from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.network.body import BodyFeatures
 from emulator.surrogates.network.family import (
+    FamilyEnsemble,
     FamilyModule,
     FamilyNetwork,
     Inputs,
-    Learned,
     Standard,
     physics_of,
 )
@@ -241,7 +241,7 @@ class Family(NamedTuple):
     """
 
     bodies: list[_Body]
-    learned: Learned
+    learned: FamilyEnsemble
 
 
 def family_of(
@@ -265,7 +265,7 @@ def family_of(
     numbers = np.array([list(each.features.shape.values()) for each in runs])
     ranges = zip(numbers.min(axis=0).tolist(), numbers.max(axis=0).tolist(), strict=True)
     scales = _scales(bodies)
-    learned = Learned(
+    learned = FamilyEnsemble(
         architecture=architecture,
         members=(),
         standard=standard,

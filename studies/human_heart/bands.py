@@ -28,7 +28,7 @@ from calibrate.measurements.surface import SurfacePoints
 from calibrate.measurements.volume import CavityVolume
 from emulator.core.errors import InputError
 from emulator.core.gaussian_process import CORRELATIONS
-from emulator.geometry.facets import MM3_PER_ML
+from emulator.core.units import MM3_PER_ML
 from emulator.scenes import Scene
 from emulator.surrogates.protocol import ForwardMap
 

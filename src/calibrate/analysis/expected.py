@@ -16,19 +16,19 @@ Student's t somewhat more than its information.
 
 **Before data.** For each of some draws of the prior data is made,
 :math:`y_r \sim p(y \mid x_r)`, and the covariance of its posterior :math:`p(x \mid y_r)` is found
-by importance sampling, from draws of the prior and of a Student's t about a Newton step from
-:math:`x_r`,
+by importance sampling (:mod:`calibrate.importance.proposals`), from draws of the prior and of a
+Student's t about a Newton step from :math:`x_r`,
 
 .. math:: w_i \propto \frac{p(x_i)\, p(y_r \mid x_i)}
                            {\beta\, p(x_i) + (1 - \beta)\, t_5(x_i;\, \hat x, Q)},
           \qquad Q = (F + P^{-1})^{-1},
 
 with the prior's covariance P and the share :math:`\beta` of draws from the prior; :math:`\hat x`
-and Q are then those of the weighted draws, and it is done again (Cappe et al. 2008; Owen and Zhou
-2000).
-If too few draws carry the weight, the covariance is Q. Posteriors are
-averaged, not informations: by Jensen's inequality the inverse of a mean information is less than
-the mean posterior covariance, and a box of a prior ends where a Gaussian does not.
+and Q are then those of the weighted draws, and draws of that Student's t are added as those of a
+third component (Cappe et al. 2008; Owen and Zhou 2000). If too few draws carry the weight, the
+covariance is the first Q. Posteriors are averaged, not informations: by Jensen's inequality the
+inverse of a mean information is less than the mean posterior covariance, and a box of a prior ends
+where a Gaussian does not.
 
 Data sets that are not measured yet differ in their shared errors: modes that depend on where points
 were seen, as pins' modes do, are made of the mean :math:`g(x_r)` of each set, so that the errors of
@@ -70,18 +70,19 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpyro.distributions as dist
 from jax.flatten_util import ravel_pytree
-from jax.scipy.linalg import solve_triangular
 from jax.scipy.special import logsumexp
 
 from calibrate.analysis.identifiability import combinations, prior_table
+from calibrate.importance.proposals import Group, Kernels, PosteriorPoints
+from calibrate.importance.weights import effective, normalised
 from calibrate.measurements import Observation, Observations
 from calibrate.model_error.algebra import check_algebra
 from calibrate.model_error.marginal import Means, ModelError, times
 from calibrate.noise import Noise, information_about_means
 from calibrate.posterior import Posterior
 from calibrate.statistical_model import Model
+from calibrate.statistical_model.density import Heights, without_nan
 from calibrate.statistical_model.errors import errors_of_data
 from emulator.core.errors import InputError
 
@@ -89,7 +90,7 @@ _DRAWS = 32  # draws of a posterior over which a gain is averaged
 _DATA_SETS = 64
 _FROM_PRIOR = 3072  # draws of the prior that all data sets share
 _AROUND = 512  # draws of Student's t for each data set
-_ROUNDS = 2  # fits of Student's t to the draws before
+_ROUNDS = 2  # proposals of a data set; the second is fitted to the draws before
 _BATCH = 128
 _EFFECTIVE = 30.0  # effective draws; below, the covariance of the linear map and a normal prior
 _DOF = 5.0
@@ -188,89 +189,116 @@ def expected_precision(
     return {"sd": dict(zip(names, ratio.tolist(), strict=True)), "combinations": best}
 
 
+class _DataPrograms:
+    """What a model predicts at unknowns x (q,), each function compiled once for all data sets."""
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        self.log_priors = jax.jit(jax.vmap(self._log_prior))
+        self.answers = jax.jit(partial(jax.lax.map, self._answer, batch_size=_BATCH))
+        self.log_likelihoods = jax.jit(self._log_likelihoods)
+        self.data_sets = jax.jit(partial(jax.lax.map, self._data_set))
+
+    def _values(self, x: jax.Array) -> dict[str, jax.Array]:
+        return dict(zip(self.model.states.unknowns, self.model.from_scales(x), strict=True))
+
+    def _log_prior(self, x: jax.Array) -> jax.Array:
+        jacobian = jnp.sum(jnp.where(self.model.on_log_scale, x, 0.0))
+        return without_nan(self.model.log_prior(self._values(x)) + jacobian)
+
+    def _answer(self, x: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
+        """Return the data without noise, and whether the map has an answer."""
+        return self.model.predict(self._values(x))
+
+    def _log_likelihood(self, x: jax.Array, answer: Any, data: Any, error: ModelError) -> jax.Array:
+        means, valid = answer
+        residual = {name: data[name] - mean for name, mean in means.items()}
+        log_density = self.model.log_density({}, means, data)
+        log_density += log_ratio(error, self.model.from_scales(x), residual, means)
+        return without_nan(jnp.where(valid, log_density, -jnp.inf))
+
+    def _log_likelihoods(
+        self, x: jax.Array, answers: Any, data: Any, error: ModelError
+    ) -> jax.Array:
+        def one(point: tuple[jax.Array, Any]) -> jax.Array:
+            return self._log_likelihood(*point, data, error)
+
+        return jax.lax.map(one, (x, answers), batch_size=_BATCH)
+
+    def _data_set(self, inputs: tuple[Any, ...]) -> tuple[Any, jax.Array, jax.Array]:
+        """Return data made at x (q,), F (q, q), and the log likelihood's slope (q,) there."""
+        x, means, error, sizes, key = inputs
+        noise_key, error_key = jax.random.split(key)
+        unknowns = jnp.concatenate([self.model.from_scales(x), sizes])
+        means = error.draw(error_key, unknowns, means)
+        parts = self.model.distributions({}, means)
+        keys = jax.random.split(noise_key, len(parts))
+        data = {n: d.sample(k) for (n, d), k in zip(parts.items(), keys, strict=True)}
+        information = information_at(self.model, self.model.observe, self.model.noise)
+        slope = jax.grad(lambda x: self._log_likelihood(x, self._answer(x), data, error))(x)
+        return data, information(x, error, sizes), slope
+
+
 def _posterior_covariances(
     model: Model, errors: Errors, prior: np.ndarray, before: np.ndarray, count: int, seed: int
 ) -> np.ndarray:
     """Return posterior covariances (r, q, q) given data made at draws of the prior's x (s, q)."""
-    names, thetas = model.states.unknowns, model.from_scales
-
-    def values(x: jax.Array) -> dict[str, jax.Array]:
-        return dict(zip(names, thetas(x), strict=True))
-
-    def log_prior(x: jax.Array) -> jax.Array:
-        log_density = model.log_prior(values(x)) + jnp.sum(jnp.where(model.on_log_scale, x, 0.0))
-        return jnp.where(jnp.isnan(log_density), -jnp.inf, log_density)
-
-    def predicted(x: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
-        return model.predict(values(x))
-
-    def log_likelihood(x: jax.Array, answer: Any, data: Any, error: ModelError) -> jax.Array:
-        means, valid = answer
-        residual = {name: data[name] - mean for name, mean in means.items()}
-        log_density = model.log_density({}, means, data)
-        log_density += log_ratio(error, thetas(x), residual, means)
-        return jnp.where(valid & jnp.isfinite(log_density), log_density, -jnp.inf)
-
-    information = information_at(model, model.observe, model.noise)
-    shared = jnp.asarray(prior[count:][:_FROM_PRIOR])
-    precision = jnp.asarray(np.linalg.inv(before))
-    ask = jax.jit(partial(jax.lax.map, predicted, batch_size=_BATCH))
-    ahead = ask(shared)
-    p_shared = jax.vmap(log_prior)(shared)
-    share = len(shared) / (len(shared) + _AROUND)
-
-    def around(centre: jax.Array, covariance: jax.Array) -> dist.MultivariateStudentT:
-        root = jnp.linalg.cholesky(covariance)
-        return dist.MultivariateStudentT(_DOF, centre, _WIDER * root)
-
-    def covariance(data_set: tuple[Any, ...]) -> jax.Array:
-        x, sizes, keys, means, error = data_set
-        noise_key, *round_keys, error_key = keys
-        means = error.draw(error_key, jnp.concatenate([thetas(x), sizes]), means)
-        parts = model.distributions({}, means)
-        each = jax.random.split(noise_key, len(parts))
-        data = {n: d.sample(k) for (n, d), k in zip(parts.items(), each, strict=True)}
-
-        def likelihood(x: jax.Array) -> jax.Array:
-            return log_likelihood(x, predicted(x), data, error)
-
-        by_shared = jax.vmap(log_likelihood, in_axes=(0, 0, None, None))
-        likely_shared = by_shared(shared, ahead, data, error)
-        # A Newton step from the data's own x, in the linear map with a normal prior.
-        root = jnp.linalg.cholesky(information(x, error, sizes) + precision)
-        half = solve_triangular(root, jnp.eye(len(x)), lower=True)
-        C = normal = half.T @ half
-        score = jax.grad(likelihood)(x) - precision @ (x - shared.mean(axis=0))
-        proposal = around(x + C @ jnp.where(jnp.isfinite(score), score, 0.0), C)
-        for k in round_keys:
-            proposals = proposal.sample(k, (_AROUND,))
-            inside = jax.vmap(log_prior)(proposals)
-            # The map may be undefined at points of prior density 0, so it is evaluated at x there.
-            evaluated = jnp.where(jnp.isfinite(inside)[:, None], proposals, x)
-            likely = jax.lax.map(likelihood, evaluated, batch_size=_BATCH)
-            points = jnp.concatenate([shared, proposals])
-            p = jnp.concatenate([p_shared, inside])
-            drawn = jnp.log1p(-share) + proposal.log_prob(points)
-            mixture = jnp.logaddexp(jnp.log(share) + p, drawn)
-            weights = jax.nn.softmax(p + jnp.concatenate([likely_shared, likely]) - mixture)
-            mean = weights @ points
-            deviation = points - mean
-            # A few draws that carry all weight hardly spread: their covariance would be too small.
-            enough = 1.0 / jnp.sum(weights**2) >= _EFFECTIVE
-            C = jnp.where(enough, (weights[:, None] * deviation).T @ deviation, normal)
-            proposal = around(mean, C)
-        return C
-
-    truths = jnp.asarray(prior[:count])
-    means, valid = ask(truths)
+    programs, shared = _DataPrograms(model), prior[count:][:_FROM_PRIOR]
+    means, valid = programs.answers(prior[:count])
     rows = _some(valid)
-    truths, means = truths[rows], {name: mean[rows] for name, mean in means.items()}
-    keys = jax.random.split(jax.random.key(seed), count)[rows]
-    keys = jax.vmap(lambda key: jax.random.split(key, 2 + _ROUNDS))(keys)
+    truths, means = prior[rows], {name: mean[rows] for name, mean in means.items()}
     set_errors = of_each(errors, means)
-    sets = truths, sizes_of(set_errors, count)[rows], keys, means, set_errors
-    covariances = np.asarray(jax.jit(partial(jax.lax.map, covariance))(sets))
-    return covariances[_some(np.isfinite(covariances).all(axis=(1, 2)))]
+    keys = jax.random.split(jax.random.key(seed), count)[rows]
+    sizes = sizes_of(set_errors, count)[rows]
+    made = programs.data_sets((truths, means, set_errors, sizes, keys))
+    log_prior, answers = np.asarray(programs.log_priors(shared)), programs.answers(shared)
+    centre, precision = shared.mean(axis=0), np.linalg.inv(before)
+    rng, covariances = np.random.default_rng(seed), []
+    for k, x in enumerate(truths):
+        of_set = jax.tree.map(lambda stacked, k=k: np.asarray(stacked[k]), (*made, set_errors))
+        data, information, slope, error = of_set
+
+        def log_densities(z: np.ndarray, x=x, data=data, error=error) -> Heights:  # noqa: ANN001
+            inside = np.asarray(programs.log_priors(z))
+            # The map may be undefined at points of prior density 0, so x takes their place.
+            z = np.where(np.isfinite(inside)[:, None], z, x)
+            return Heights(inside, programs.log_likelihoods(z, programs.answers(z), data, error))
+
+        likelihood = programs.log_likelihoods(shared, answers, data, error)
+        points = PosteriorPoints(
+            z=shared, at=Heights(log_prior, likelihood), priors=len(shared),
+            log_kernels=np.zeros((0, len(shared))), log_densities=log_densities,
+        )  # fmt: skip
+        # A Newton step from the data's own x, in the linear map with a normal prior.
+        normal = np.linalg.inv(information + precision)
+        score = slope - precision @ (x - centre)
+        start = x + normal @ np.where(np.isfinite(score), score, 0.0)
+        covariances.append(_covariance(points, start, normal, rng))
+    return np.stack(covariances)[_some(np.isfinite(covariances).all(axis=(1, 2)))]
+
+
+def _covariance(
+    points: PosteriorPoints, centre: np.ndarray, normal: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """Return a posterior's covariance (q, q); NaN where it has no density.
+
+    points : draws of the prior. centre, normal : the mean (q,) and covariance of the linear map's.
+    """
+    C = normal
+    for _ in range(_ROUNDS):
+        if not np.isfinite(C).all():
+            break
+        kernel = Group.at_mode(centre, _WIDER * np.linalg.cholesky(C), 1)
+        points = points.extended(Kernels((kernel,), (1.0,), _DOF), _AROUND, rng)
+        weights = normalised(points.log_weights)
+        if not weights.any():
+            return np.full_like(normal, np.nan)
+        centre = weights @ points.z
+        deviation = points.z - centre
+        # A few draws that carry all weight hardly spread: their covariance would be too small.
+        enough = effective(weights) >= _EFFECTIVE
+        C = (weights[:, None] * deviation).T @ deviation if enough else normal
+    return C
 
 
 def _some(valid: Any) -> np.ndarray:

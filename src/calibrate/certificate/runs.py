@@ -31,6 +31,7 @@ from calibrate.statistical_model.predictive import (
     Correction,
     Predictive,
     fit_correction,
+    gauss_newton_step,
     no_correction,
 )
 
@@ -167,7 +168,7 @@ class _Descent:
         prior, gradient, curvature = predictive.curvature(z, runs.means[k], slopes)
         if not (np.isfinite(gradient).all() and np.isfinite(curvature).all()):
             return None
-        step, gain = _gauss_newton_step(gradient, curvature, predictive.prior_sd)
+        step, gain = gauss_newton_step(gradient, curvature, predictive.prior_sd, _LONGEST)
         log_posterior = prior + runs.fem[k]
         return cls(z, log_posterior, curvature, z + step, log_posterior + gain)
 
@@ -243,17 +244,3 @@ def _points_around(
         root = sd[:, None] * vectors / np.sqrt(np.maximum(values, 1.0))
         clouds.append(end.z + rng.normal(size=(_POINTS_OF_END, len(sd))) @ root.T)
     return tuple(clouds)
-
-
-def _gauss_newton_step(
-    gradient: np.ndarray, curvature: np.ndarray, sd: np.ndarray
-) -> tuple[np.ndarray, float]:
-    """Return the Gauss-Newton step (p,), shortened to the longest, and its expected gain."""
-    scaled = curvature * sd * sd[:, None]
-    values, vectors = eigh(scaled)
-    # The prior's curvature is 1; where the likelihood is not concave, only the prior's is left.
-    along = vectors.T @ (gradient * sd) / np.maximum(values, 1.0)
-    length = float(np.linalg.norm(along))
-    along *= min(1.0, _LONGEST / length) if length > 0.0 else 1.0
-    gain = along @ (vectors.T @ (gradient * sd)) - 0.5 * along @ (values * along)
-    return sd * (vectors @ along), float(gain)

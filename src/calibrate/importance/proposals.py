@@ -23,7 +23,7 @@ in separate places, as of a posterior with several modes, have a map and a covar
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Self
 
@@ -268,6 +268,11 @@ class WeightedPoints(ABC):
             log_kernels=np.vstack([points.log_kernels, proposal.log_density(points.z)[None]]),
         )
 
+    def continued(self, count: int, rng: np.random.Generator) -> Self:
+        """Return the points with ``count`` more from the last proposal."""
+        points = self.with_points(self.proposals[-1].sample(rng, count))
+        return replace(points, counts=(*self.counts[:-1], self.counts[-1] + count))
+
     def with_points(self, z: np.ndarray) -> Self:
         """Return the points with added ones z (s, p), which do not come from the proposals."""
         new = self.densities(z)
@@ -281,6 +286,41 @@ class WeightedPoints(ABC):
     def log_kernels_at(self, z: np.ndarray) -> np.ndarray:
         """Return the log density (c, s) of each proposal at points z (s, p)."""
         return np.array([q.log_density(z) for q in self.proposals]).reshape(-1, len(z))
+
+
+LogDensities = Callable[[np.ndarray], Any]  # z (s, p) to log densities (s,): prior, likelihood
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PosteriorPoints(WeightedPoints):
+    """Points of one posterior, with the log densities of ``log_densities``."""
+
+    log_densities: LogDensities
+
+    @classmethod
+    def of_proposal(
+        cls, proposal: Kernels, count: int, rng: np.random.Generator, log_densities: LogDensities
+    ) -> Self:
+        """Return ``count`` points from ``proposal``, and none from the prior."""
+        z = proposal.sample(rng, count)
+        return cls(
+            z=z, at=log_densities(z), priors=0, proposals=(proposal,), counts=(count,),
+            log_kernels=proposal.log_density(z)[None], log_densities=log_densities,
+        )  # fmt: skip
+
+    def densities(self, z: np.ndarray) -> Any:
+        """Return the log densities at points z (s, p)."""
+        return self.log_densities(z)
+
+    @property
+    def log_posterior(self) -> np.ndarray:
+        """Log posterior density (s,) at the points, up to the evidence, their mean weight."""
+        return np.asarray(self.at.prior + self.at.likelihood)
+
+    @property
+    def log_weights(self) -> np.ndarray:
+        """Log weights (s,) of the posterior."""
+        return self.log_posterior - self.log_mixture
 
 
 def effective_number(log_weights: np.ndarray) -> float:

@@ -1,21 +1,27 @@
 r"""Where a point lies: in which element of a body, and over which facet of a surface.
 
-**In the body.** scikit-fem finds the element of a point inside the body. A point outside, or inside
-a curved element but not inside its straight-edged one, is moved onto the nearest element, by
-inverting the element's map :math:`x(\xi) = \sum_a N_a(\xi)\, X_a` with Newton's method.
+A point belongs to the closest element or facet. In the body its distance is zero; a point that
+lies slightly outside, or inside the walls of a curved body but not of its mesh, is moved onto the
+element. Barycentric coordinates are positive and add up to 1: :math:`\lambda_i = s_i^2 / |s|^2`.
+With :math:`x(\lambda) = \sum_a N_a(\lambda)\, X_a` and the cell's size h, Newton's method
+(:mod:`emulator.core.small_newton`) finds
 
-**On a surface.** The closest point of a triangle is the foot of the perpendicular to its plane, or,
-where the foot lies outside, the closest point of the three edges. On curved facets
-:math:`x(\xi) = \sum_a N_a(\xi)\, X_a` that is the start of Gauss-Newton iterations on
-:math:`|x(\xi) - p|^2`.
+.. math:: \min_s \; \frac{|x(\lambda(s)) - p|^2}{2 h^2} + \frac{(|s|^2 - 1)^2}{2} .
+
+The second term fixes the length of s, and is zero at the minimum. Cells are searched in the order
+of their spheres' distances until no sphere is closer than the closest point so far.
 """
 
 from __future__ import annotations
 
+from functools import partial
+
+import jax
+import jax.numpy as jnp
 import numpy as np
-from skfem import MeshTet
 
 from emulator.core.errors import InputError
+from emulator.core.small_newton import minimise_by_newton
 from emulator.core.units import other_units
 from emulator.geometry.discretisation import shapes_at
 from emulator.geometry.mesh import Mesh
@@ -25,11 +31,16 @@ from emulator.geometry.mesh import Mesh
 _SLACK = 1e-3
 _SEVERAL = 3  # points, from which their span is compared with the body's
 _LEAST, _MOST = 0.003, 5.0  # limits of the span, in sizes of the body
-_ON_THE_FACE = 1e-9  # round-off of a barycentric coordinate
-_ELEMENTS = 32  # nearest straight-edged elements that are searched for a point
-_FACETS = 16  # nearest facets of a surface that are searched for a point
-_NEWTON_STEPS = 12  # largest number of steps; an element with straight edges takes one
-_GAUSS_NEWTON_STEPS = 20  # the distance of a point on the surface converges quadratically
+_AT_A_TIME = 32  # cells that are searched together, the most promising first
+# Step of s at the end. To a point on a face s falls by a third a step only, and its square counts.
+_TOLERANCE = 1e-7
+_BEYOND = 2.0  # no point of a quadratic cell is further from its middle, in distances of its nodes
+# Corners at the ends of the edges (2, e) that the middle nodes of quadratic facets and elements lie
+# on, in the order of the nodes.
+_EDGES = {
+    6: np.array([[0, 1, 2], [1, 2, 0]]),
+    10: np.array([[0, 1, 0, 0, 1, 2], [1, 2, 2, 3, 3, 3]]),
+}
 
 
 def locate(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -38,21 +49,15 @@ def locate(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     :class:`InputError` for a point further outside than a thousandth of the body's size.
     """
     _check_extent(mesh, points)
-    straight = MeshTet(mesh.nodes.T.copy(), mesh.corners.T.copy(), sort_t=False, validate=False)
-    finder, nodes = straight.element_finder(), mesh.nodes[mesh.elements]
-    elements, coordinates = [], []
-    for k, point in enumerate(points):
-        try:
-            element = finder(*point[:, None])
-            inside = _invert(nodes[element], point)[0]
-            is_inside = bool(inside.min() >= -_ON_THE_FACE)
-        except ValueError:  # outside every straight-edged element
-            is_inside = False
-        if not is_inside:
-            element, inside = _nearest(mesh, k, point)
-        elements.append(int(element[0]))
-        coordinates.append(inside[0])
-    return np.array(elements), np.array(coordinates)
+    elements, inside, distances = closest_points(mesh.nodes[mesh.elements], points)
+    outside = ~(distances <= _SLACK * mesh.size)
+    if outside.any():
+        k = int(np.argmax(outside))
+        raise InputError(
+            f"landmark {k} at {points[k].tolist()} mm lies outside the body, "
+            f"about {distances[k]:.2g} mm away"
+        )
+    return elements, inside
 
 
 def gradients_at(mesh: Mesh, elements: np.ndarray, inside: np.ndarray) -> np.ndarray:
@@ -79,76 +84,72 @@ def _check_extent(mesh: Mesh, points: np.ndarray) -> None:
     )
 
 
-def _invert(X: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return barycentric coordinates (c, 4) of ``point`` in elements with nodes ``X`` (c, a, 3).
+def closest_points(
+    cells: np.ndarray, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the cell (d,) closest to each point (d, 3), its barycentric coordinates, its distance.
 
-    They are not clipped: a coordinate below 0 says that the point lies beyond a face. Their
-    gradients (c, 4, 3) in space, 1/mm, are returned, too.
+    The coordinates, (d, 4) in elements and (d, 3) on facets, are those of the closest point.
+
+    cells : the nodes (c, a, 3) of linear or quadratic elements or facets, mm.
     """
-    order = 1 if X.shape[1] == 4 else 2
-    xi = np.full((len(X), 3), 0.25)
-    for _ in range(1 if order == 1 else _NEWTON_STEPS):
-        values, slopes = shapes_at(order, _barycentric(xi))
-        # d xi / d x, the inverse of the element map's Jacobian; JAX's batched LAPACK is slower.
-        inverse = np.linalg.inv(np.einsum("cai,caj->cij", X, slopes))
-        step = np.einsum("cji,ci->cj", inverse, point - np.einsum("ca,cai->ci", values, X))
-        # Far outside a curved element its map folds: Newton's method stays close to the element.
-        xi = xi + step if order == 1 else np.clip(xi + step, -0.5, 1.5)
-        if np.abs(step).max() < 1e-13:
-            break
-    return _barycentric(xi), np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)
+    corners = 4 if cells.shape[1] in (4, 10) else 3
+    middles = cells.mean(axis=1)
+    radii = _BEYOND * np.linalg.norm(cells - middles[:, None], axis=2).max(axis=1)
+    indices, coordinates, closest = [], [], []
+    for point in points:
+        gaps = np.linalg.norm(middles - point, axis=1)
+        least = gaps - radii  # no cell is closer than this
+        near = np.flatnonzero(least <= (gaps + radii).min())
+        order = near[np.argsort(least[near], kind="stable")]
+        best = (0, np.zeros(corners), np.inf)
+        for begin in range(0, len(order), _AT_A_TIME):
+            rows = np.resize(order[begin : begin + _AT_A_TIME], _AT_A_TIME)
+            if least[rows[0]] > best[2]:
+                break
+            inside, distances = map(np.asarray, _closest(cells[rows], point, corners))
+            k = int(np.argmin(distances))
+            if distances[k] < best[2]:
+                best = (int(rows[k]), inside[k], float(distances[k]))
+        indices.append(best[0])
+        coordinates.append(best[1])
+        closest.append(best[2])
+    return np.array(indices, dtype=int), np.array(coordinates), np.array(closest)
 
 
-def _barycentric(xi: np.ndarray) -> np.ndarray:
-    return np.concatenate([1.0 - xi.sum(axis=1, keepdims=True), xi], axis=1)
+@partial(jax.jit, static_argnums=2)
+def _closest(X: jax.Array, point: jax.Array, corners: int) -> tuple[jax.Array, jax.Array]:
+    """Return barycentric coordinates (c, k) and distances (c,) of the closest points of cells."""
+
+    def closest(X: jax.Array) -> tuple[jax.Array, jax.Array]:
+        size = jnp.max(jnp.ptp(X, axis=0))
+
+        def barycentric(s: jax.Array) -> jax.Array:
+            return s**2 / jnp.sum(s**2)
+
+        def gap(s: jax.Array) -> jax.Array:
+            return (_shapes(barycentric(s), len(X)) @ X - point) / size
+
+        def function(s: jax.Array) -> jax.Array:
+            return 0.5 * jnp.sum(gap(s) ** 2) + 0.5 * (jnp.sum(s**2) - 1.0) ** 2
+
+        def quadratic(s: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+            return *jax.value_and_grad(function)(s), jax.hessian(function)(s)
+
+        # From the middle: along a coordinate that is 0 the slope is 0, and the search would stay.
+        middle = jnp.full(corners, corners**-0.5)
+        s = minimise_by_newton(quadratic, middle, tolerance=_TOLERANCE).x
+        return barycentric(s), size * jnp.linalg.norm(gap(s))
+
+    return jax.vmap(closest)(X)
 
 
-def _nearest(mesh: Mesh, k: int, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the element nearest to ``point``, and the barycentric coordinates (1, 4) on it."""
-    every = mesh.nodes[mesh.elements]
-    distances, _ = _onto(every[:, :4], point)
-    candidates = np.argsort(distances, kind="stable")[:_ELEMENTS]
-    distances, inside = _onto(every[candidates], point)
-    best = int(np.argmin(distances))
-    if not distances[best] <= _SLACK * mesh.size:
-        raise InputError(
-            f"landmark {k} at {point.tolist()} mm lies outside the body, "
-            f"about {distances[best]:.2g} mm away"
-        )
-    return candidates[[best]], inside[[best]]
-
-
-def _onto(X: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the element's closest points to ``point``: distances (c,), coordinates (c, 4).
-
-    The barycentric coordinates are those of the point moved onto the element: from beyond a face
-    along its normal; coordinates that are still below 0 are clipped.
-    """
-    coordinates, gradients = _invert(X, point)
-    rows = np.arange(len(X))
-    lowest = np.argmin(coordinates, axis=1)
-    normal = gradients[rows, lowest]
-    beyond = np.minimum(coordinates[rows, lowest], 0.0) / np.sum(normal**2, axis=1)
-    inside = coordinates - beyond[:, None] * np.einsum("cai,ci->ca", gradients, normal)
-    inside = np.maximum(inside, 0.0)
-    inside /= inside.sum(axis=1, keepdims=True)
-    shapes, _ = shapes_at(1 if X.shape[1] == 4 else 2, inside)
-    positions = np.einsum("ca,cai->ci", shapes, X)
-    return np.linalg.norm(positions - point, axis=1), inside
-
-
-def closest_point(facets: np.ndarray, point: np.ndarray) -> tuple[int, np.ndarray]:
-    """Return the facet closest to ``point`` (3,), and the closest point's barycentric (3,) there.
-
-    ``facets`` (f, 3 or 6, 3) are the positions of the nodes of linear or quadratic facets, mm.
-    """
-    coordinates, distances = _onto_triangles(facets[:, :3], point)
-    candidates = np.arange(len(facets))
-    if facets.shape[1] == 6:
-        candidates = np.argsort(distances, kind="stable")[:_FACETS]
-        coordinates, distances = _onto_curved(facets[candidates], coordinates[candidates], point)
-    best = int(np.argmin(distances))
-    return int(candidates[best]), coordinates[best]
+def _shapes(barycentric: jax.Array, nodes: int) -> jax.Array:
+    """Return the shape functions (a,) at barycentric coordinates (k,) of a simplex."""
+    if nodes == len(barycentric):
+        return barycentric
+    ends = barycentric[_EDGES[nodes]]
+    return jnp.concatenate([barycentric * (2.0 * barycentric - 1.0), 4.0 * ends[0] * ends[1]])
 
 
 def facet_shapes(barycentric: np.ndarray, nodes: int) -> tuple[np.ndarray, np.ndarray]:
@@ -166,42 +167,3 @@ def facet_shapes(barycentric: np.ndarray, nodes: int) -> tuple[np.ndarray, np.nd
     corners = (4.0 * L - 1.0)[:, :, None] * along
     middles = 4.0 * (L[:, i, None] * along[j] + L[:, j, None] * along[i])
     return values, np.concatenate([corners, middles], axis=1)
-
-
-def _onto_triangles(corners: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return each triangle's closest point, barycentric (f, 3), and its distance (f,)."""
-    side = corners[:, 1:] - corners[:, :1]
-    gram = np.einsum("fai,fbi->fab", side, side)
-    right = np.einsum("fai,fi->fa", side, point - corners[:, 0])
-    last = np.linalg.solve(gram, right[..., None])[..., 0]
-    candidates = [np.column_stack([1.0 - last.sum(axis=1), last])]
-    for i, j in ((0, 1), (1, 2), (2, 0)):
-        edge = corners[:, j] - corners[:, i]
-        t = np.einsum("fi,fi->f", point - corners[:, i], edge) / np.sum(edge**2, axis=1)
-        on_edge = np.zeros((len(corners), 3))
-        on_edge[:, j] = np.clip(t, 0.0, 1.0)
-        on_edge[:, i] = 1.0 - on_edge[:, j]
-        candidates.append(on_edge)
-    points = np.stack(candidates)
-    distances = np.linalg.norm(np.einsum("efa,fai->efi", points, corners) - point, axis=-1)
-    distances[0, points[0].min(axis=1) < 0.0] = np.inf  # beyond an edge
-    best, rows = np.argmin(distances, axis=0), np.arange(len(corners))
-    return points[best, rows], distances[best, rows]
-
-
-def _onto_curved(
-    facets: np.ndarray, barycentric: np.ndarray, point: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return closest points on quadratic facets (f, 6, 3), from a start on straight ones."""
-    for _ in range(_GAUSS_NEWTON_STEPS):
-        values, slopes = facet_shapes(barycentric, 6)
-        offset = point - np.einsum("fa,fai->fi", values, facets)
-        tangents = np.einsum("fad,fai->fdi", slopes, facets)
-        gram = np.einsum("fdi,fei->fde", tangents, tangents)
-        right = np.einsum("fdi,fi->fd", tangents, offset)
-        step = np.linalg.solve(gram, right[..., None])[..., 0]
-        clipped = np.maximum(barycentric + np.column_stack([-step.sum(axis=1), step]), 0.0)
-        barycentric = clipped / clipped.sum(axis=1, keepdims=True)
-    values, _ = facet_shapes(barycentric, 6)
-    positions = np.einsum("fa,fai->fi", values, facets)
-    return barycentric, np.linalg.norm(positions - point, axis=1)

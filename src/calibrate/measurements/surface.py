@@ -40,7 +40,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.sparse import csr_array
 
-from calibrate.measurements.location import closest_point, facet_shapes
+from calibrate.measurements.location import closest_points, facet_shapes
 from calibrate.measurements.observation import DataField, Layout
 from calibrate.measurements.points import (
     XYZ,
@@ -148,9 +148,9 @@ class SurfacePoints(OfFacetSet):
         points = as_points(points, "surface points", distinct=False)
         facets = scene.mesh.facet_set(facet_set)
         X = scene.mesh.nodes[facets]
-        rows, inside = zip(*(closest_point(X, point) for point in points), strict=True)
-        weights, slopes = facet_shapes(np.array(inside), facets.shape[1])
-        X = X[list(rows)]
+        rows, inside, _ = closest_points(X, points)
+        weights, slopes = facet_shapes(inside, facets.shape[1])
+        X = X[rows]
         feet = np.einsum("da,dai->di", weights, X)
         for k, distance in enumerate(np.linalg.norm(feet - points, axis=1)):
             if not distance <= slack * scene.mesh.size:
@@ -160,7 +160,7 @@ class SurfacePoints(OfFacetSet):
                 )
         normals = np.cross(*np.einsum("dat,dai->tdi", slopes, X))
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        nodes, members = gather(facets[list(rows)])
+        nodes, members = gather(facets[rows])
         return cls(facet_set, nodes, feet, normals, members, weights)
 
 

@@ -47,7 +47,8 @@ from jax.flatten_util import ravel_pytree
 
 from calibrate.noise.protocol import Scale
 from emulator.core.errors import InputError
-from emulator.core.gaussian_process import eliminated
+from emulator.core.gaussian_process import kernel_mean
+from emulator.core.small_matrices import eliminate
 from emulator.surrogates.protocol import fingerprint_of
 
 Means = Mapping[str, jax.Array]
@@ -86,8 +87,8 @@ class Amplitude:
     def __call__(self, unknowns: jax.Array) -> jax.Array:
         """Return the size, (), at ``unknowns`` (q,): between the least and greatest of the runs."""
         at = (unknowns - self.centre) / self.scale
-        log_weights = -0.5 * jnp.sum(((at - self.x) / self.width) ** 2, axis=-1)
-        return jnp.exp(jax.nn.softmax(log_weights) @ self.log_sizes)
+        squared = jnp.sum(((at - self.x) / self.width) ** 2, axis=-1)
+        return jnp.exp(kernel_mean(squared, self.log_sizes))
 
     @property
     def upper(self) -> float:
@@ -158,7 +159,7 @@ class Term:
             return 1.0 + alpha**2 * self.strength, alpha * (self.weights @ columns)
         V = self.at(alpha, means)
         VW = times(V, self.information)
-        return eliminated(VW @ V.T + jnp.eye(len(V)), VW @ columns)
+        return eliminate(VW @ V.T + jnp.eye(len(V)), VW @ columns)
 
 
 @jax.tree_util.register_dataclass

@@ -53,8 +53,8 @@ from calibrate.population.model import (
 )
 from calibrate.statistical_model import Data
 from calibrate.statistical_model.density import Target, threads_for
-from emulator.core.gaussian_process import eliminated
 from emulator.core.kept import kept
+from emulator.core.small_matrices import eliminate
 
 
 class Information(NamedTuple):
@@ -97,7 +97,7 @@ def scores_of(
         P = jnp.eye(len(e)) + root.T @ information.precision @ root
         gradient = information.slope + information.precision @ (slope * score)
         # P = L diag(pivots) L^T, so that C = L diag(sqrt(pivots)).
-        pivots, inverse_L = eliminated(P, jnp.eye(len(e)))
+        pivots, inverse_L = eliminate(P, jnp.eye(len(e)))
         inverse_C = inverse_L / jnp.sqrt(pivots)[:, None]
         z = inverse_C.T @ (inverse_C @ (root.T @ gradient) + e)
         return z, -0.5 * jnp.sum(jnp.log(pivots))

@@ -25,7 +25,7 @@ from calibrate.posterior.taken_up import TakenUp, sentences, taken_up
 from calibrate.provenance import as_attributes, versions
 from calibrate.samplers import check_options, density_of, find_sampler, named_draws
 from calibrate.samplers.checkpoint import Checkpoint, identity_of
-from calibrate.samplers.modes import MISSED_BY, MOST, MOST_BY_FEM, Modes, explore, missed_mode
+from calibrate.samplers.modes import MISSED_BY, MOST, MOST_BY_FEM, explore, missed_mode
 from calibrate.samplers.protocol import Context
 from calibrate.state_names import split
 from calibrate.statistical_model import Data, Model
@@ -257,8 +257,7 @@ def sample(
         key = jax.random.fold_in(jax.random.key(seed), _MODES)
         starts = prior_draws(density, key, MOST if density.batches else MOST_BY_FEM)
         modes = explore(density, checked, starts, z)
-        places = Modes([mode.z for mode in modes], [mode.height for mode in modes])
-        attributes |= missed_mode(density, checked, z, places)
+        attributes |= missed_mode(density, checked, z, modes)
     rng_key = jax.random.fold_in(jax.random.key(seed), _PREDICTIONS) if predictions else None
     draws = named_draws(model, run.z)
     tree = make_tree(model, checked, draws, run.statistics, rng_key)

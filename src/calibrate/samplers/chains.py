@@ -160,7 +160,7 @@ def compile_chains(density: Target, sampler: ChainSampler, options: ChainOptions
     return Programs(start, advance, density.at_once)
 
 
-class _State(NamedTuple):
+class _ChainCheckpoint(NamedTuple):
     """The state from which a killed run continues."""
 
     run: Any  # _PILOT or _FINAL
@@ -253,18 +253,18 @@ class Chains:
         self.bar.total = max(self.bar.total, planned, self.bar.n + count)
         self.bar.update(count)
 
-    def _state(self) -> _State:
+    def _state(self) -> _ChainCheckpoint:
         # While they warm up, chains have no draws, but names and shapes of draws are known.
         def none(draws: jax.ShapeDtypeStruct) -> np.ndarray:
             return np.zeros((draws.shape[0], 0, *draws.shape[2:]), draws.dtype)
 
         draws = join(self._parts or [jax.tree.map(none, self._template().draws)])
-        return _State(self.run, self.warmed, self.map_, self.states, draws)
+        return _ChainCheckpoint(self.run, self.warmed, self.map_, self.states, draws)
 
-    def _template(self) -> _State:
+    def _template(self) -> _ChainCheckpoint:
         number = jax.ShapeDtypeStruct((), int)
         states, draws = self.programs.shapes(self.options.chains, self.data, self.map_)
-        return _State(number, number, self.map_, states, draws)
+        return _ChainCheckpoint(number, number, self.map_, states, draws)
 
 
 def join(parts: list[Draws]) -> Draws:

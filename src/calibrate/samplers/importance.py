@@ -43,11 +43,11 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from scipy.special import logsumexp
 
 from calibrate.importance.proposals import (
     Group,
     Kernels,
+    PosteriorPoints,
     effective_number,
     key_from,
     resampled,
@@ -58,7 +58,6 @@ from calibrate.samplers.diagnostics import ENOUGH_ESS, RUN_UNTIL_R_HAT, converge
 from calibrate.samplers.modes import (
     MOST,
     Mode,
-    Modes,
     explore,
     heavy,
     merged,
@@ -123,42 +122,6 @@ class ImportanceOptions(Options):
     label: ClassVar[str] = "importance"
 
 
-@dataclass(frozen=True, eq=False)
-class Population:
-    """Weighted points z (s, p) of one proposal.
-
-    at : the log prior and log likelihood of the points, (s,) each.
-    log_proposal : the log density (s,) of what the points were drawn from.
-    proposal : that, where it is no prior.
-    """
-
-    z: np.ndarray
-    at: Heights
-    log_proposal: np.ndarray
-    proposal: Kernels | None = None
-
-    @property
-    def log_posterior(self) -> np.ndarray:
-        """Log posterior density (s,) at the points, up to the evidence."""
-        return self.at.prior + self.at.likelihood
-
-    @property
-    def log_weights(self) -> np.ndarray:
-        """Log weights (s,) of the posterior."""
-        return self.log_posterior - self.log_proposal
-
-    @property
-    def log_evidence(self) -> float:
-        """Logarithm of the mean weight."""
-        return float(logsumexp(self.log_weights) - np.log(len(self.z)))
-
-    def and_more(self, other: Population) -> Population:
-        """Return the points with others of the same proposal."""
-        at = Heights(*(np.concatenate(both) for both in zip(self.at, other.at, strict=True)))
-        log_proposal = np.concatenate([self.log_proposal, other.log_proposal])
-        return Population(np.concatenate([self.z, other.z]), at, log_proposal, self.proposal)
-
-
 class _Run:
     """One population: its generator, its points, and how many evaluations they took."""
 
@@ -170,8 +133,9 @@ class _Run:
         self._tempered = min(_TEMPERED * density.dimension**2, _MOST_TEMPERED)
         self._step = max(round(_STEP * self._tempered), _FEWEST)
         z = prior_draws(density, key_from(self._rng), round(_PRIOR * self._step))
-        at = self._heights(z)
-        self.points = Population(z, at, at.prior)
+        self.points = PosteriorPoints(
+            z=z, at=self._heights(z), priors=len(z), log_densities=self._heights
+        )
         if not np.isfinite(self.points.log_weights).any():
             raise SolverError("the posterior density is zero at every draw of the prior")
         self.modes: list[Mode] = []
@@ -240,7 +204,8 @@ class _Run:
                 "importance: the posterior density is zero at every point of a step; use nuts"
             )
         around = z[self._rng.choice(len(z), size=chosen, p=weights)]
-        self.points = self._drawn(self._kernels(around, widths, beside), count)
+        proposal = self._kernels(around, widths, beside)
+        self.points = PosteriorPoints.of_proposal(proposal, count, self._rng, self._heights)
 
     def _kernels(self, around: np.ndarray, widths: tuple[float, ...], beside: float) -> Kernels:
         """Return kernels around points (s, p), those nearest to each mode apart, and at modes.
@@ -273,10 +238,6 @@ class _Run:
         inside = mode.distances(self.points.z) < len(mode.z) + 4.0 * np.sqrt(2.0 * len(mode.z))
         return float(normalised(self.points.log_weights)[inside].sum()) > _HOLDS * share
 
-    def _drawn(self, proposal: Kernels, count: int) -> Population:
-        z = proposal.sample(self._rng, count)
-        return Population(z, self._heights(z), proposal.log_density(z), proposal)
-
     def _heights(self, z: np.ndarray) -> Heights:
         """Return log densities, which count as evaluations."""
         self.evaluations += len(z)
@@ -290,8 +251,7 @@ class _Run:
     def draw(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Return draws z (count, p) and their log posterior densities (count,)."""
         while effective_number(self.points.log_weights) < _WORTH * count:
-            assert self.points.proposal is not None
-            self.points = self.points.and_more(self._drawn(self.points.proposal, _FRESH))
+            self.points = self.points.continued(_FRESH, self._rng)
         rows = resampled(normalised(self.points.log_weights), count, self._rng)
         return self.points.z[rows], self.points.log_posterior[rows]
 
@@ -308,13 +268,14 @@ def _of_all(runs: list[_Run]) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([points.z for points in populations]), np.concatenate(log_weights)
 
 
-def _evidence(populations: list[Population]) -> dict[str, float]:
+def _evidence(populations: list[PosteriorPoints]) -> dict[str, float]:
     r"""Return attributes: the log of the mean evidence of populations, and its standard error.
 
     The variance of a mean weight is told by the weights, :math:`1 / n - 1 / s` of the square for
     :math:`s` points that are worth :math:`n`, and by how the populations differ; the larger counts.
     """
-    logarithms = np.array([points.log_evidence for points in populations])
+    sums = [np.logaddexp.reduce(points.log_weights) for points in populations]
+    logarithms = np.array(sums) - np.log([len(points.z) for points in populations])
     shifted, count = np.exp(logarithms - logarithms.max()), len(logarithms)
     mean = shifted.mean()
     within = [
@@ -403,8 +364,7 @@ class ImportanceSampling(Sampler):
             UNSEEN: unseen(counts),
             **_evidence([run.points for run in runs]),
         }
-        places = Modes([mode.z for mode in modes], [mode.height for mode in modes])
-        attributes |= missed_mode(density, data, draws.z.reshape(-1, density.dimension), places)
+        attributes |= missed_mode(density, data, draws.z.reshape(-1, density.dimension), modes)
         return draws._replace(attributes=attributes)
 
 

@@ -23,11 +23,12 @@ import numpy as np
 
 from calibrate.importance.weights import FEWEST_WEIGHTS, effective, normalised, pareto_shape
 from calibrate.samplers.modes import (
-    Modes,
+    Ends,
+    climb_from,
     coloured,
     curvature,
-    find_modes,
     missed_mode,
+    modes_at,
     programs_of,
 )
 from calibrate.samplers.protocol import Context, Draws, Options, Sampler
@@ -64,11 +65,11 @@ class LaplaceOptions(Options):
 
 
 class _Gaussian(NamedTuple):
-    """Mode (p,), precision H (p, p), and all modes, the highest first."""
+    """Mode (p,), precision H (p, p), and the ends of all climbs."""
 
     mode: Any
     precision: Any
-    modes: Any
+    ends: Any
 
 
 class Laplace(Sampler):
@@ -91,15 +92,15 @@ class Laplace(Sampler):
         """
         start_key, key = jax.random.split(jax.random.key(context.seed))
         number = np.zeros(())
-        template = _Gaussian(number, number, Modes(number, number))
+        template = _Gaussian(number, number, Ends(number, number))
         gaussian = context.checkpoint.restore(lambda: template)
         if gaussian is None:
-            modes = find_modes(density, data, prior_draws(density, start_key, options.starts))
-            if not len(modes.z):
+            ends = climb_from(density, data, prior_draws(density, start_key, options.starts))
+            if not len(ends.z):
                 raise SolverError(
                     "the posterior density is zero wherever the optimiser could start"
                 )
-            precision, smallest, distance = curvature(density, data, modes.z[0])
+            precision, smallest, distance = curvature(density, data, ends.z[0])
             if not smallest > 0.0:
                 raise SolverError(
                     f"the posterior has no curvature at its mode in some direction ({smallest:.2g})"
@@ -110,7 +111,7 @@ class Laplace(Sampler):
                     f"the optimiser stopped {distance:.2g} sd from a mode: the posterior density "
                     "ends or bends sharply there; use a sampler, such as nuts"
                 )
-            gaussian = _Gaussian(modes.z[0], precision, modes)
+            gaussian = _Gaussian(ends.z[0], precision, ends)
             context.checkpoint.keep(lambda: gaussian)
         z, lp, log_q = _draw(density, gaussian, data, options, key)
         shape = (options.chains, options.draws)
@@ -119,7 +120,7 @@ class Laplace(Sampler):
             "approximation": "gaussian",
             "pareto_k": pareto_shape(lp - log_q),
             "importance_efficiency": effective(normalised(lp - log_q)) / len(lp),
-            **missed_mode(density, data, z, gaussian.modes),
+            **missed_mode(density, data, z, modes_at(density, data, gaussian.ends)),
         }
         return Draws(z.reshape(*shape, -1), statistics, attributes)
 

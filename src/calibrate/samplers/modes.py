@@ -59,7 +59,7 @@ def coloured(noise: np.ndarray, factor: np.ndarray) -> np.ndarray:
     return solve_triangular(factor, noise.T, lower=True, trans="T").T
 
 
-class _Programs(NamedTuple):
+class _DensityPrograms(NamedTuple):
     """Compiled functions of a density.
 
     value_and_gradient : (z (p,), data) -> log density (), gradient (p,).
@@ -74,9 +74,9 @@ class _Programs(NamedTuple):
 
 
 @kept
-def programs_of(density: Density) -> _Programs:
+def programs_of(density: Density) -> _DensityPrograms:
     """Return the compiled functions of a density, which the density keeps."""
-    return _Programs(
+    return _DensityPrograms(
         jax.jit(jax.value_and_grad(density.log_density)),
         jax.jit(lambda z, data: jax.lax.map(lambda row: density.log_density(row, data), z)),
         Lock(),
@@ -90,21 +90,21 @@ def white_at_mode(
 
     starts : points (m, p) from which the optimiser starts.
     """
-    modes = find_modes(density, data, starts)
-    highest = _mode_at(density, data, modes.z[0], modes.heights[0]) if len(modes.z) else None
+    ends = climb_from(density, data, starts)
+    highest = _mode_at(density, data, ends.z[0], ends.heights[0]) if len(ends.z) else None
     return None if highest is None else (highest.z, highest.root)
 
 
-class Modes(NamedTuple):
-    """Points ``z`` (m, p) where the optimiser ended, and log densities (m,), the highest first."""
+class Ends(NamedTuple):
+    """Points ``z`` (m, p) where climbs ended, and log densities (m,), the highest first."""
 
     z: Any
     heights: Any
 
 
-def find_modes(
+def climb_from(
     density: Density, data: Data, starts: np.ndarray, draws: np.ndarray | None = None
-) -> Modes:
+) -> Ends:
     """Return where L-BFGS ends from points ``starts`` (m, p); none where the density is zero.
 
     draws : draws (s, p) of the posterior, if there are any; in coordinates in which they are white
@@ -113,8 +113,8 @@ def find_modes(
     climb = _climber(density, data, draws)
     ends = [end for end in map(climb, starts) if np.isfinite(end[1])]
     ends = sorted(ends, key=lambda end: -end[1])
-    z = np.array([each for each, _ in ends]).reshape(len(ends), density.dimension)
-    return Modes(z, np.array([height for _, height in ends]))
+    z = np.array([point for point, _ in ends]).reshape(len(ends), density.dimension)
+    return Ends(z, np.array([height for _, height in ends]))
 
 
 def _climber(
@@ -224,7 +224,7 @@ def explore(
     All climb where there are several modes of account: where the first batch ended at one, none of
     the others does. Ends that are no modes, as on a flat ridge, are left out.
 
-    draws : as of :func:`find_modes`.
+    draws : as of :func:`climb_from`.
     """
     climb, modes = _climber(density, data, draws), list[Mode]()
     for number, start in enumerate(starts):
@@ -237,6 +237,12 @@ def explore(
         elif np.isfinite(height) and (mode := _mode_at(density, data, z, height)) is not None:
             modes = merged([*modes, mode])
     return modes
+
+
+def modes_at(density: Density, data: Data, ends: Ends) -> list[Mode]:
+    """Return every mode at which climbs ended once, the heaviest first."""
+    modes = (_mode_at(density, data, z, height) for z, height in zip(*ends, strict=True))
+    return merged(mode for mode in modes if mode is not None)
 
 
 def _mode_at(density: Density, data: Data, z: np.ndarray, height: float) -> Mode | None:
@@ -258,7 +264,9 @@ def unseen(counts: Sequence[int]) -> float:
     return 0.5 * once**2 / twice if twice else 0.5 * once * (once - 1)
 
 
-def missed_mode(density: Density, data: Data, z: np.ndarray, modes: Modes) -> dict[str, Any]:
+def missed_mode(
+    density: Density, data: Data, z: np.ndarray, modes: Sequence[Mode]
+) -> dict[str, Any]:
     """Return attributes of a run with draws ``z`` (s, p): the heaviest of ``modes`` missed."""
     program = programs_of(density).value_and_gradient
 
@@ -268,29 +276,25 @@ def missed_mode(density: Density, data: Data, z: np.ndarray, modes: Modes) -> di
 
     attributes: dict[str, Any] = {MISSED_BY: np.inf}
     covariance = _covariance(z)
-    if len(modes.z) == 0 or covariance is None:
+    if not modes or covariance is None:
         return attributes
     log_det = np.linalg.slogdet(covariance)[1]
     whitener = np.linalg.cholesky(np.linalg.inv(covariance))
     some = z[np.linspace(0, len(z) - 1, min(_SAMPLE, len(z))).astype(int)]
-    log_mass_of_draws = np.mean([height(each) for each in some])
+    log_mass_of_draws = np.mean([height(point) for point in some])
     log_mass_of_draws += 0.5 * (len(covariance) * (1.0 + np.log(2.0 * np.pi)) + log_det)
-    for mode, top in zip(*modes, strict=True):
-        distances = (((z - mode) @ whitener) ** 2).sum(axis=1)
+    for mode in modes:
+        distances = (((z - mode.z) @ whitener) ** 2).sum(axis=1)
         if distances.min() < _BESIDE**2:
             continue
         nearest = z[np.argmin(distances)]
         way = np.linspace(0.0, 1.0, _ON_THE_WAY + 2)[1:-1, None]
-        lowest = min(height(each) for each in mode + way * (nearest - mode))
-        if not lowest < min(top, height(nearest)) - _VALLEY:
+        lowest = min(height(point) for point in mode.z + way * (nearest - mode.z))
+        if not lowest < min(mode.height, height(nearest)) - _VALLEY:
             continue
-        precision, smallest, distance = curvature(density, data, mode)
-        if not (smallest > 0.0 and distance < _AWAY):  # flat there, or no mode
-            continue
-        log_mass = top + 0.5 * (len(mode) * np.log(2.0 * np.pi) - np.linalg.slogdet(precision)[1])
-        lighter = float(log_mass_of_draws - log_mass)
+        lighter = float(log_mass_of_draws - mode.log_mass)
         if lighter < min(attributes[MISSED_BY], _LIGHTER):
-            named = density.constrain(jnp.asarray(mode)[None])
+            named = density.constrain(jnp.asarray(mode.z)[None])
             words = ", ".join(f"{name} {float(value[0]):.4g}" for name, value in named.items())
             attributes = {MISSED_BY: lighter, MISSED_AT: words}
     return attributes

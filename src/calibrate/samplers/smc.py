@@ -77,7 +77,7 @@ class _Particles(NamedTuple):
     steps: Any  # number of temperatures so far
 
 
-class _State(NamedTuple):
+class _ParticleCheckpoint(NamedTuple):
     """The state from which a killed run continues: the finished sets, and the current one."""
 
     done: _Particles
@@ -102,7 +102,7 @@ class TemperedSMC(Sampler):
         programs, checkpoint = _compile(density, options), context.checkpoint
         keys = jax.random.split(jax.random.key(context.seed), options.chains)
         template = jax.eval_shape(programs.start, keys[0])
-        state = checkpoint.restore(lambda: _State(template, template))
+        state = checkpoint.restore(lambda: _ParticleCheckpoint(template, template))
         done: list[_Particles] = []
         current: Any = None
         if state is not None:
@@ -122,7 +122,7 @@ class TemperedSMC(Sampler):
                             "allow more temperatures, or look at the likelihood: it may be flat or "
                             "very sharp"
                         )
-                    checkpoint.keep(lambda: _State(_stack(done, template), current))  # noqa: B023
+                    checkpoint.keep(lambda: _ParticleCheckpoint(_stack(done, template), current))  # noqa: B023
                 done.append(current)
                 bar.update()
                 current = None
@@ -155,14 +155,14 @@ def _stack(sets: list[_Particles], template: Any) -> _Particles:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *sets)
 
 
-class _Programs(NamedTuple):
+class _SMCPrograms(NamedTuple):
     start: Callable[..., Any]  # (rng_key) -> a set at temperature 0
     step: Callable[..., Any]  # (set, data) -> the set at the next temperature
     finish: Callable[..., Any]  # (particles (k, n, p), data) -> log densities (k, n)
 
 
 @kept
-def _compile(density: Density, options: SMCOptions) -> _Programs:
+def _compile(density: Density, options: SMCOptions) -> _SMCPrograms:
     import blackjax  # only some samplers need this import
     from blackjax.smc import base, resampling
 
@@ -226,7 +226,7 @@ def _compile(density: Density, options: SMCOptions) -> _Programs:
     def finish(particles: jax.Array, data: Data) -> jax.Array:
         return jax.vmap(jax.vmap(density.log_density, (0, None)), (0, None))(particles, data)
 
-    return _Programs(jax.jit(start), jax.jit(step), jax.jit(finish))
+    return _SMCPrograms(jax.jit(start), jax.jit(step), jax.jit(finish))
 
 
 def _increment(heights: jax.Array, remaining: jax.Array, survivors: float) -> jax.Array:

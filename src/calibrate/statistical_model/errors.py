@@ -47,6 +47,7 @@ from emulator.accuracy.estimate import newton_distance
 from emulator.accuracy.mesh_error import MeshErrorEstimate
 from emulator.core.display import counting
 from emulator.core.errors import InputError, SolverError
+from emulator.core.gaussian_process import kernel_mean
 from emulator.fem import Simulator
 from emulator.fem.compiled import compiled
 from emulator.fem.solution import EquilibriumSolver
@@ -346,5 +347,4 @@ def _left_out(x: np.ndarray, values: np.ndarray, width: float) -> np.ndarray:
     """Return leave-one-out predictions of ``values`` (n,) at ``x`` (n, q) by kernel regression."""
     squared = np.sum((x[:, None] - x[None]) ** 2, axis=-1) / width**2
     np.fill_diagonal(squared, np.inf)
-    weights = np.exp(-0.5 * (squared - squared.min(axis=1, keepdims=True)))
-    return weights @ values / weights.sum(axis=1)
+    return np.asarray(kernel_mean(squared, values))

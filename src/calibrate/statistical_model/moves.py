@@ -23,7 +23,12 @@ from calibrate.importance.proposals import Kernels
 from calibrate.importance.weights import normalised
 from calibrate.statistical_model.density import finite_coordinates
 from calibrate.statistical_model.pool import Pool
-from calibrate.statistical_model.predictive import Correction, Predictive, fit_correction
+from calibrate.statistical_model.predictive import (
+    Correction,
+    Predictive,
+    fit_correction,
+    gauss_newton_step,
+)
 
 _ROUNDS = 3  # of points that are no draws
 _SURPRISE = (
@@ -92,7 +97,8 @@ def _uphill(predictive: Predictive, answer: FEMAnswer) -> np.ndarray:
     """Return the point (p,) a Gauss-Newton step up FEM's log posterior from an answer's point."""
     means = predictive.means(answer.z[None])[0][0] + answer.error
     _, gradient, curvature = predictive.curvature(answer.z, means, predictive.slopes(answer.z))
-    return finite_coordinates(answer.z + np.linalg.solve(curvature, gradient))
+    step, _ = gauss_newton_step(gradient, curvature, predictive.prior_sd)
+    return finite_coordinates(answer.z + step)
 
 
 def _heights(predictive: Predictive, answers: list[FEMAnswer]) -> np.ndarray:

@@ -40,7 +40,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import eigh
 
 from calibrate.statistical_model.density import (
     BATCH,
@@ -52,7 +52,7 @@ from calibrate.statistical_model.density import (
     without_nan,
 )
 from calibrate.statistical_model.model import Data, Model
-from emulator.core.gaussian_process import squared_exponential
+from emulator.core.gaussian_process import Regression, squared_exponential
 
 _LENGTHS = (0.25, 0.5, 1.0, 2.0, 4.0)  # correlation lengths that are compared, in sd of the points
 _NUGGETS = (1e-6, 1e-4, 1e-2, 1.0, 1e2)
@@ -103,12 +103,17 @@ def no_correction(rows: int, features: int, data: int) -> Correction:
     return Correction(at, weights, inverse, centre, width, 1.0, 0.0, 0.0, local=False)
 
 
+def _covariance(products: Any, squared: Any) -> Any:
+    """Return k(x, x') from products of standardised features and squared distances in lengths."""
+    return _TREND * (1.0 + products) + squared_exponential(squared)
+
+
 def correct(correction: Correction, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the correction (m,) at features ``x`` (q,), and its variance in squared noise sd."""
     c = correction
     x = (x - c.centre) / c.width
     distance = jnp.sum((c.at - x) ** 2, axis=-1)
-    kernel = _TREND * (1.0 + c.at @ x) + squared_exponential(distance / c.length**2)
+    kernel = _covariance(c.at @ x, distance / c.length**2)
     prior_variance = _TREND * (1.0 + x @ x) + 1.0 + c.nugget
     variance = c.scale * jnp.maximum(prior_variance - kernel @ c.inverse @ kernel, c.nugget)
     return kernel @ c.weights, variance
@@ -174,16 +179,15 @@ def _fitted(
     x = (x - centre) / width
     fitted = no_correction(rows, x.shape[1], errors.shape[1])._replace(centre=centre, width=width)
     fitted.at[: len(x)] = x
-    linear = _TREND * (1.0 + x @ x.T)
     smallest, where_likely = np.inf, np.inf
     distances = ((x[:, None] - x) ** 2).sum(axis=-1)
     for length, nugget in kernels:
-        kernel = linear + squared_exponential(distances / length**2) + nugget * np.eye(len(x))
-        inverse = cho_solve(cho_factor(kernel), np.eye(len(x)))
-        weights = inverse @ errors
+        kernel = _covariance(x @ x.T, distances / length**2) + nugget * np.eye(len(x))
+        regression = Regression.of(kernel)
+        inverse, weights = regression.inverse(), regression.weights(errors)
         # Leave-one-out errors in noise sd, and their variances up to a^2.
-        square = np.mean((weights / np.diag(inverse)[:, None] / scales) ** 2, axis=1)
         variance = 1.0 / np.diag(inverse)
+        square = np.mean((weights * variance[:, None] / scales) ** 2, axis=1)
         # Geometric mean over the points, so that the prior's corners do not decide.
         losses = np.log(square + _NEGLIGIBLE**2)
         if losses.mean() < smallest:
@@ -192,6 +196,23 @@ def _fitted(
             scale = float(np.mean(square / variance))
             fitted = fitted._replace(length=length, nugget=nugget, scale=scale)
     return fitted, where_likely
+
+
+def gauss_newton_step(
+    gradient: np.ndarray, curvature: np.ndarray, prior_sd: np.ndarray, longest: float = np.inf
+) -> tuple[np.ndarray, float]:
+    """Return the Gauss-Newton step (p,) up a log posterior, and its expected gain.
+
+    gradient, curvature : as of :meth:`Predictive.curvature`.
+    longest : the length to which the step is shortened, in sd of the prior.
+    """
+    values, vectors = eigh(curvature * prior_sd * prior_sd[:, None])
+    # The prior's curvature is 1; where the likelihood is not concave, only the prior's is left.
+    slope = vectors.T @ (gradient * prior_sd)
+    along = slope / np.maximum(values, 1.0)
+    length = float(np.linalg.norm(along))
+    along *= min(1.0, longest / length) if length > 0.0 else 1.0
+    return prior_sd * (vectors @ along), float(along @ slope - 0.5 * along @ (values * along))
 
 
 class Densities(NamedTuple):

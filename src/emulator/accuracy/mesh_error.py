@@ -38,6 +38,7 @@ import numpy as np
 
 from emulator.accuracy.estimate import Distance, newton_distance
 from emulator.core.errors import InputError
+from emulator.core.gaussian_process import Regression
 from emulator.fem.compiled import compiled
 from emulator.fem.linear.suitesparse import free_factors
 from emulator.fem.simulator import Simulator
@@ -197,13 +198,9 @@ class MeshError:
 def _weights(known: np.ndarray, x: np.ndarray) -> np.ndarray:
     r"""Return the weights (k,) with which known positions (k, p) come closest to ``x`` (p,).
 
-    At the minimum :math:`(X X^T + 10^{-2} I)\, w + \mu = X x` with the multiplier of the sum.
+    At the minimum :math:`(X X^T + 10^{-2} I)\, w = X x + \mu 1`: regression with a linear kernel.
     """
-    count = len(known)
-    matrix = np.ones((count + 1, count + 1))
-    matrix[:count, :count] = known @ known.T + _RIDGE * np.eye(count)
-    matrix[count, count] = 0.0
-    return np.linalg.solve(matrix, np.append(known @ x, 1.0))[:count]
+    return Regression.of(known @ known.T + _RIDGE * np.eye(len(known))).kriging_weights(known @ x)
 
 
 def mesh_error(simulator: Simulator | Scene, *, most: int = LARGEST) -> MeshError:

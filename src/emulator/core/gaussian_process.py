@@ -1,7 +1,14 @@
-r"""Gaussian processes: correlation functions, and regression on values and their derivatives.
+r"""Gaussian processes: correlation functions, and regression on values and on derivatives.
 
-A correlation function gives the correlation of two points at the squared distance :math:`\rho`, in
-units of the length scales:
+**Regression.** Observations y at inputs X, of covariance K with their noise, have the mean
+:math:`k(x, X)\, K^{-1} y` at another input x (Rasmussen and Williams 2006, Equation 2.25). If their
+constant mean is unknown, it is :math:`w^T y` with the weights of least variance among those of sum
+1 (ordinary kriging),
+
+.. math:: w = K^{-1} \left(k(X, x) + \mu 1\right), \qquad 1^T w = 1 .
+
+**Correlations.** A correlation function gives the correlation of two points at the squared distance
+:math:`\rho`, in units of the length scales:
 
 .. math::
     \text{squared exponential:} \quad & e^{-\rho/2} \\
@@ -9,7 +16,9 @@ units of the length scales:
     \text{Mat\'ern 7/2:} \quad & \left(1 + a + \tfrac25 a^2 + \tfrac1{15} a^3\right) e^{-a},
         \qquad a = \sqrt{7\rho}
 
-(Rasmussen and Williams 2006, Equations 4.9 and 4.16). The regression takes Matern 7/2, three times
+(Rasmussen and Williams 2006, Equations 4.9 and 4.16).
+
+**Derivatives.** The regression on values and derivatives takes Matern 7/2, three times
 differentiable, of the distance between features :math:`\psi` of two inputs,
 
 .. math:: \rho = |\delta|^2, \qquad \delta = \Lambda\,[\psi(x) - \psi(y)],
@@ -38,7 +47,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import cho_solve, solve_triangular
+import scipy
+from jax.scipy.linalg import solve_triangular
 
 from emulator.core.minimise import minimise
 
@@ -70,6 +80,45 @@ CORRELATIONS: dict[str, Callable[[Any], Any]] = {
     "squared_exponential": squared_exponential,
 }
 """Correlation functions that options call by name."""
+
+
+def kernel_mean(squared: Any, values: Any) -> Any:
+    """Return the mean (...) of ``values`` (n,), each weighted by its squared exponential.
+
+    It lies between the least and the greatest value (Nadaraya 1964, Watson 1964).
+
+    squared : the squared scaled distances (..., n).
+    """
+    weights = squared_exponential(squared - squared.min(axis=-1, keepdims=True))
+    return weights @ values / weights.sum(axis=-1)
+
+
+class Regression(NamedTuple):
+    """The regression on n observations; it computes with NumPy where its arrays are NumPy's.
+
+    factor : the lower Cholesky factor (n, n) of their covariance K, which includes their noise.
+    """
+
+    factor: Any
+
+    @classmethod
+    def of(cls, covariance: Any) -> Regression:
+        """Return the regression on observations of this covariance (n, n)."""
+        return cls(_library(covariance).linalg.cholesky(covariance))
+
+    def weights(self, observations: Any) -> Any:
+        """Return K^-1 y of observations y (n, ...); times k(x, X) they are the mean at x."""
+        linalg = scipy.linalg if isinstance(self.factor, np.ndarray) else jax.scipy.linalg
+        return linalg.cho_solve((self.factor, True), observations)
+
+    def inverse(self) -> Any:
+        """Return K^-1, (n, n)."""
+        return self.weights(_library(self.factor).eye(len(self.factor)))
+
+    def kriging_weights(self, covariances: Any) -> Any:
+        """Return w (n,), of sum 1, at an input x of ``covariances`` k(X, x), (n,)."""
+        at_x, of_ones = self.weights(covariances), self.inverse().sum(axis=1)
+        return at_x + of_ones * ((1.0 - at_x.sum()) / of_ones.sum())
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))
@@ -125,12 +174,11 @@ def covariance(features: Features) -> jax.Array:
     return blocks.transpose(0, 2, 1, 3).reshape([count * (1 + parameters)] * 2)
 
 
-def _factor(features: Features) -> tuple[jax.Array, jax.Array]:
-    """Return prior standard deviations (N,) and the Cholesky factor of the correlations."""
+def _standardised(features: Features) -> tuple[jax.Array, Regression]:
+    """Return prior standard deviations (N,), and the regression on observations in their units."""
     K = covariance(features)
     sd = jnp.sqrt(jnp.diagonal(K))
-    correlation = K / sd[:, None] / sd + JITTER * jnp.eye(len(K))
-    return sd, jnp.linalg.cholesky(correlation)
+    return sd, Regression.of(K / sd[:, None] / sd + JITTER * jnp.eye(len(K)))
 
 
 def negative_log_likelihood(features: Features, observations: jax.Array) -> jax.Array:
@@ -140,7 +188,7 @@ def negative_log_likelihood(features: Features, observations: jax.Array) -> jax.
     observations : values and derivatives of r outputs, input by input, (c (1 + p), r). The variance
         of each output is its most likely one, the mean square of its whitened observations.
     """
-    sd, factor = _factor(features)
+    sd, (factor,) = _standardised(features)
     white = solve_triangular(factor, observations / sd[:, None], lower=True)
     variances = jnp.mean(white**2, axis=0)
     determinant = jnp.mean(jnp.log(jnp.diagonal(factor)) + jnp.log(sd))
@@ -165,8 +213,8 @@ def fit_lengths(features: Features, observations: jax.Array) -> np.ndarray:
 
 def fit_weights(features: Features, observations: jax.Array) -> jax.Array:
     """Return the weights (c (1 + p), r) with which the mean passes through the observations."""
-    sd, factor = _factor(features)
-    return cho_solve((factor, True), observations / sd[:, None]) / sd[:, None]
+    sd, regression = _standardised(features)
+    return regression.weights(observations / sd[:, None]) / sd[:, None]
 
 
 def fold(features: Features, weights: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -175,8 +223,8 @@ def fold(features: Features, weights: jax.Array) -> tuple[jax.Array, jax.Array]:
     A derivative in position acts through the features' derivatives, so its p weights are q here.
     """
     count, _, parameters = features.derivative.shape
-    each = weights.reshape(count, 1 + parameters, -1)
-    return each[:, 0], jnp.einsum("cqp,cpr->cqr", features.derivative, each[:, 1:])
+    of_run = weights.reshape(count, 1 + parameters, -1)
+    return of_run[:, 0], jnp.einsum("cqp,cpr->cqr", features.derivative, of_run[:, 1:])
 
 
 def mean(
@@ -194,31 +242,3 @@ def mean(
     return matern72(squared) @ value_weights + along @ derivative_weights.reshape(
         count * width, outputs
     )
-
-
-def eliminated(matrix: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
-    r"""Return the pivots p (r,) and the reduced rows R (r, m), by elimination without exchanges.
-
-    :math:`M = L P L^T` with a unit lower triangular L and pivots :math:`P = \mathrm{diag}(p)`. Then
-    :math:`|M| = \prod_k p_k`, and with :math:`R = L^{-1} A`
-
-    .. math:: A^T M^{-1} A = R^T P^{-1} R .
-
-    Plain arithmetic, which may be batched: ``jax.vmap`` of ``jnp.linalg.solve``, ``inv``, ``det``
-    and ``cholesky`` of small matrices has been seen to hang on processors of few cores.
-
-    matrix : the positive definite matrix M, (r, r).
-    rows : A, (r, m).
-    """
-    later = jnp.arange(len(matrix))
-
-    def step(
-        state: tuple[jax.Array, jax.Array], k: jax.Array
-    ) -> tuple[tuple[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
-        M, R = state
-        pivot, row = M[k, k], R[k]
-        factor = jnp.where(later > k, M[:, k] / pivot, 0.0)
-        return (M - factor[:, None] * M[k], R - factor[:, None] * row), (pivot, row)
-
-    reduced: tuple[jax.Array, jax.Array] = jax.lax.scan(step, (matrix, rows), later)[1]
-    return reduced

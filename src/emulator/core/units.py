@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from emulator.core.errors import InputError
 
 _WITH_UNIT = re.compile(r"([^\[(]*[^\[( ]) *(?:[\[(] *([^\])]*?) *[\])])?")
-KPA_PER_MMHG = 0.133322
+KPA_PER_MMHG, MM3_PER_ML = 0.133322, 1000.0
 
 IN_KPA = {
     "kPa": 1.0, "Pa": 1e-3, "MPa": 1e3, "N/mm2": 1e3, "N/cm2": 10.0, "N/m2": 1e-3, "mN/mm2": 1.0,
@@ -22,7 +22,7 @@ IN_KPA = {
 """Stresses and pressures."""
 IN_MN = {"mN": 1.0, "N": 1e3, "g": 9.80665, "gf": 9.80665, "kgf": 9806.65, "kN": 1e6}
 """Forces."""
-IN_MM = {"mm": 1.0, "cm": 10.0, "um": 1e-3, "µm": 1e-3, "m": 1e3}
+IN_MM = {"mm": 1.0, "cm": 10.0, "m": 1e3, "um": 1e-3, "µm": 1e-3}
 """Lengths."""
 IN_MM2 = {"mm2": 1.0, "cm2": 100.0, "m2": 1e6}
 """Areas."""

@@ -29,6 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.errors import InputError
+from emulator.core.units import MM3_PER_ML
 from emulator.geometry.discretisation import FacetRule, facet_rule
 from emulator.geometry.mesh import SIDES, Mesh, cross_sides, parts, unshared
 
@@ -150,7 +151,6 @@ def _lids[A: (jax.Array, np.ndarray)](edges: A, middle: A) -> A:
     return xp.stack(corners, axis=-2)
 
 
-MM3_PER_ML = 1000.0
 _FLAT = 1e-9  # volumes below this fraction of the mesh's size cubed are round-off: a plane patch
 
 

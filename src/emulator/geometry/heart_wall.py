@@ -32,7 +32,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from emulator.core.errors import InputError
-from emulator.geometry.facets import MM3_PER_ML, Cavity, mean_normal
+from emulator.core.units import MM3_PER_ML
+from emulator.geometry.facets import Cavity, mean_normal
 from emulator.geometry.fibres import Axis, nodal_depth
 from emulator.geometry.mesh import Mesh, find_rows, signed_volumes
 

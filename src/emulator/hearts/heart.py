@@ -29,13 +29,13 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from emulator.core.errors import InputError, look_up
+from emulator.core.units import IN_MM
 from emulator.geometry.discretisation import mesh_quality
 from emulator.geometry.fibres import BOTH
 from emulator.geometry.mesh import SIDES, Mesh
 from emulator.geometry.refinement import to_linear
 from emulator.hearts.remeshing import DiscMap, Unmeshable, rim_loops, triangulate
 from emulator.hearts.surfaces import (
-    UNITS,
     Surface,
     area_vector,
     axes_across,
@@ -112,7 +112,7 @@ def mesh_heart(
     """
     if order not in (1, 2):
         raise InputError(f"order {order}: expected 1 or 2")
-    look_up(UNITS, unit, "unit")
+    look_up(IN_MM, unit, "unit")
     if smooth < 0 or not least > 0.0:
         raise InputError(f"smooth {smooth}, least {least} mm: expected 0 times or more, above 0 mm")
     originals = [

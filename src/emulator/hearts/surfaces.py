@@ -26,8 +26,6 @@ from emulator.geometry.facets import enclosed_volume, openings
 from emulator.geometry.file_formats import read_cells
 from emulator.geometry.mesh import SIDES, parts
 
-UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 0.001}
-"""Millimetres in a unit of length."""
 _MERGE = 1e-6  # distance over the extent below which points are merged
 _SNAP = 1e-4  # of the extent: points this near a plane lie in it, so that no slivers are cut off
 # Taubin's filter: halves what repeats every five edges and keeps what repeats every twenty.

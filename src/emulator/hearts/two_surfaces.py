@@ -18,12 +18,11 @@ from pathlib import Path
 import numpy as np
 
 from emulator.core.errors import InputError, look_up
-from emulator.geometry.facets import MM3_PER_ML
+from emulator.core.units import IN_MM, MM3_PER_ML
 from emulator.geometry.mesh import Mesh, signed_volumes
 from emulator.hearts.left_wall import left_wall
 from emulator.hearts.remeshing import DiscMap, Unmeshable, triangulate
 from emulator.hearts.surfaces import (
-    UNITS,
     Surface,
     axes_across,
     cut,
@@ -91,7 +90,7 @@ def mesh_wall(
     """
     if order not in (1, 2):
         raise InputError(f"order {order}: expected 1 or 2")
-    look_up(UNITS, unit, "unit")
+    look_up(IN_MM, unit, "unit")
     if smooth < 0:
         raise InputError(f"smooth {smooth}: expected 0 times or more")
     intact = [

@@ -11,12 +11,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from emulator.core.errors import InputError
+from emulator.core.units import IN_MM, MM3_PER_ML
 from emulator.geometry.discretisation import MeshQuality, discretise, mesh_quality
-from emulator.geometry.facets import MM3_PER_ML, Cavity
+from emulator.geometry.facets import Cavity
 from emulator.geometry.mesh import SIDES, Mesh, find_rows, orient
 from emulator.geometry.refinement import to_quadratic, unfolded
 from emulator.hearts.remeshing import DiscMap, Remeshed, Unmeshable, tetrahedralise
-from emulator.hearts.surfaces import UNITS, Surface, place_of, read_surface
+from emulator.hearts.surfaces import Surface, place_of, read_surface
 
 _EXTENTS = 4.0, 600.0  # mm; nobody's heart is smaller or larger, a mouse's being 7 mm long
 _SMALLER = (
@@ -153,11 +154,11 @@ def surface_in_mm(source: str | Path | Surface, name: str, unit: str) -> Surface
     if isinstance(source, Surface):
         surface = replace(source, name=name)
     else:
-        surface = read_surface(source, name, UNITS[unit])
+        surface = read_surface(source, name, IN_MM[unit])
     if not _EXTENTS[0] <= surface.extent <= _EXTENTS[1]:
         raise InputError(
             f"{name}: it is {surface.extent:.3g} mm from corner to corner, lengths being taken as "
-            f"{unit}: give the file's own --unit, {', '.join(UNITS)}"
+            f"{unit}: give the file's own --unit, {', '.join(IN_MM)}"
         )
     return surface
 

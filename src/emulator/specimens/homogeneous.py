@@ -7,8 +7,8 @@ Free stretches d minimise the energy density, compressible or not,
     \text{the same with }\; \det F(d) = 1 ,
 
 where a test under load control pulls with :math:`P_i`, by Newton's method from the stretches that
-keep the volume. Its steps go down the energy and keep every stretch above a fifth of its value. An
-incompressible specimen needs no pressure: the last free stretch follows from the others,
+keep the volume (:mod:`emulator.core.small_newton`); every stretch stays positive. An incompressible
+specimen needs no pressure: the last free stretch follows from the others,
 
 .. math:: F_{ll} = (1 - \det F|_{F_{ll} = 0}) / \operatorname{cof}(F)_{ll} ,
 
@@ -31,6 +31,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.errors import InputError, SolverError
+from emulator.core.small_matrices import solve_modified
+from emulator.core.small_newton import minimise_by_newton
 from emulator.fem.energy import point_energy
 from emulator.fem.material_point import stress_and_moduli
 from emulator.fem.solution import Solution, Status
@@ -39,13 +41,7 @@ from emulator.scenes.scene import all_nodes, check_nodes
 from emulator.specimens.specimen import Specimen, require_specimen
 from emulator.surrogates.protocol import ForwardKind, Prediction, fingerprint_of
 
-_ITERATIONS = 300  # an exponent falls by about 1 in each, far away
-_CONVERGED = 1e-9  # step, of a stretch; the next one would be its square
-_ARMIJO = 1e-4
-_LEAST = 0.2  # share of a stretch that a step leaves
 _GUESSES = np.concatenate([[0.0], np.geomspace(0.01, 0.9, 20)])  # strains along a pull
-_SHORT = 1e-6  # steps that round-off in the energy may not refuse
-_FLAT = 1e-10  # least pivot, relative to the stiffness
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,89 +269,13 @@ def equilibrium(
         tried = start + (1.0 + start) * jnp.asarray(guesses)[:, None] * along
         energies = jax.vmap(potential)(tried)
         start = tried[jnp.argmin(jnp.where(jnp.isfinite(energies), energies, jnp.inf))]
-    found = jax.lax.stop_gradient(_minimised(linearised, start))
+    end = jax.lax.stop_gradient(minimise_by_newton(linearised, start, low=-1.0))
     # One more step, whose stiffness is a constant, has the derivative of the equilibrium.
-    stress = jax.grad(point.energy)(gradient(found.d), tissue) - jnp.diag(pulls)
-    slope = jnp.where(own, jnp.einsum("ij,ija->a", stress, slope_of(found.d)), 0.0)
-    step = _solved(found.stiffness, slope)
-    converged = found.converged & jnp.all(jnp.isfinite(step))
-    return gradient(found.d - jnp.where(converged, step, 0.0)), converged
-
-
-class Minimum(NamedTuple):
-    """A minimum at d (u,) with its stiffness (u, u), and whether it was found."""
-
-    d: jax.Array
-    stiffness: jax.Array
-    converged: jax.Array
-
-
-class _Descent(NamedTuple):
-    """Stretches d (u,) less 1 on the way from ``base``, whose step (u,) is taken by ``fraction``.
-
-    stiffness : the stiffness (u, u) at the base in kPa.
-    energy, decrease : the energy at the base in kPa, and its rate along the step.
-    evaluations : the number of evaluations.
-    """
-
-    d: jax.Array
-    base: jax.Array
-    step: jax.Array
-    stiffness: jax.Array
-    fraction: jax.Array
-    energy: jax.Array
-    decrease: jax.Array
-    evaluations: jax.Array
-
-
-def _minimised(linearised: Callable, start: jax.Array) -> Minimum:
-    """Return the minimum of the energy that ``linearised`` gives with slope and stiffness."""
-
-    def descend(at: _Descent) -> _Descent:
-        energy, slope, stiffness = linearised(at.d)
-        lower = energy <= at.energy + _ARMIJO * at.fraction * at.decrease
-        good = jnp.isfinite(energy) & (lower | (jnp.max(jnp.abs(at.step)) < _SHORT))
-        step = -_solved(stiffness, slope)
-        most = (1.0 - _LEAST) * (1.0 + at.d) / jnp.where(step < 0.0, -step, jnp.inf)
-        fraction = jnp.minimum(1.0, jnp.min(jnp.where(step < 0.0, most, 1.0)))
-        decrease = jnp.vdot(slope, step)
-        next_d = at.d + fraction * step
-        there = _Descent(next_d, at.d, step, stiffness, fraction, energy, decrease, at.evaluations)
-        half = 0.5 * at.fraction
-        back = at._replace(d=at.base + half * at.step, fraction=half)
-        chosen = jax.tree.map(lambda yes, no: jnp.where(good, yes, no), there, back)
-        return chosen._replace(evaluations=at.evaluations + 1)
-
-    def unfinished(at: _Descent) -> jax.Array:
-        return (jnp.max(jnp.abs(at.step)) > _CONVERGED) & (at.evaluations < _ITERATIONS)
-
-    none, inf = jnp.zeros(()), jnp.array(jnp.inf)
-    size = len(start)
-    begin = _Descent(
-        start, start, jnp.full(size, jnp.inf), jnp.eye(size), none, inf, none, jnp.array(0)
-    )
-    end = jax.lax.while_loop(unfinished, descend, begin)
-    found = (jnp.max(jnp.abs(end.step)) <= _CONVERGED) & jnp.all(jnp.isfinite(end.d))
-    stiffness = jnp.where(found, end.stiffness, jnp.eye(size))
-    return Minimum(jnp.where(found, end.d, start), stiffness, found)
-
-
-def _solved(K: jax.Array, rhs: jax.Array) -> jax.Array:
-    """Return K^-1 rhs of a symmetric (u, u) matrix, u at most 3, its pivots made positive.
-
-    Elimination is written out: batches of small systems can hang in LAPACK.
-    """
-    least, count = _FLAT * jnp.max(jnp.abs(K)), len(rhs)
-    rows, y, pivots = list(K), list(rhs), list[jax.Array]()
-    for k in range(count):
-        pivots.append(jnp.maximum(jnp.abs(rows[k][k]), least))
-        for below in range(k + 1, count):
-            factor = rows[below][k] / pivots[k]
-            rows[below], y[below] = rows[below] - factor * rows[k], y[below] - factor * y[k]
-    for k in reversed(range(count)):
-        known = sum((rows[k][j] * y[j] for j in range(k + 1, count)), jnp.zeros(()))
-        y[k] = (y[k] - known) / pivots[k]
-    return jnp.stack(y)
+    stress = jax.grad(point.energy)(gradient(end.x), tissue) - jnp.diag(pulls)
+    slope = jnp.where(own, jnp.einsum("ij,ija->a", stress, slope_of(end.x)), 0.0)
+    step = solve_modified(end.hessian, slope)
+    converged = end.converged & jnp.all(jnp.isfinite(step))
+    return gradient(end.x - jnp.where(converged, step, 0.0)), converged
 
 
 def homogeneous(scene: Specimen, *, incompressible: bool = False) -> Homogeneous:

@@ -8,7 +8,7 @@ from scipy.stats import chi2, norm
 import calibrate as cal
 from calibrate.certificate import estimates
 from calibrate.certificate.estimates import jackknife, misfits, missed_by, moments
-from calibrate.certificate.runs import Runs
+from calibrate.certificate.runs import FEMRuns
 from calibrate.posterior.diagnosis import Misfit
 from calibrate.statistical_model.pool import Pool
 from calibrate.statistical_model.predictive import Predictive, no_correction
@@ -157,7 +157,7 @@ def test_runs_that_fem_finds_likely_and_the_map_does_not_are_counted(beam):
     by_hand = np.sum(likely & (log_likelihoods(step, data, points) < exact - 3.0))
     seen, missing = (Predictive(m, m.check_data(data)) for m in (right, wrong))
     z = seen.unconstrain({"mu": points[:, 0], "lam": points[:, 1]})
-    runs = Runs(z, exact, np.zeros((6, 9)), np.ones(6), (None,) * 6, (None,) * 6)
+    runs = FEMRuns(z, exact, np.zeros((6, 9)), np.ones(6), (None,) * 6, (None,) * 6)
     rng = np.random.default_rng(0)
     # As of the wrong map: none beyond its step.
     draws = exact_posterior(right, data, count=400, keep=lambda x: x[:, 0] < 72.5).draws()
@@ -169,7 +169,7 @@ def test_runs_that_fem_finds_likely_and_the_map_does_not_are_counted(beam):
         rows, drawn = pool.tests(tests, rng)
         at = predictive.constrain(pool.z[rows])
         found = log_likelihoods(fem, data, np.stack([at["mu"], at["lam"]], axis=1))
-        tested = Runs(pool.z[rows], found, np.zeros((tests, 9)), np.ones(tests), (), ())
+        tested = FEMRuns(pool.z[rows], found, np.zeros((tests, 9)), np.ones(tests), (), ())
         return missed_by(estimates.Tests(pool, tested, rows, drawn), runs)
 
     assert counted(missing, 20) == by_hand > 0  # too few tests to meet what is hidden
@@ -187,7 +187,7 @@ def test_masses_are_below_as_many_quantiles_as_are_limited(beam, levels, monkeyp
     z = predictive.unconstrain(posterior.draws())
     pool = Pool.search(predictive, no_correction(1, 2, 9), z, (), rng)
     rows, drawn = pool.tests(50, rng)
-    runs = Runs(pool.z[rows], pool.at.corrected[rows], np.zeros((50, 9)), np.ones(50), (), ())
+    runs = FEMRuns(pool.z[rows], pool.at.corrected[rows], np.zeros((50, 9)), np.ones(50), (), ())
     tests = estimates.Tests(pool, runs, rows, drawn)
     of_draws, of_corrected, mean, _ = estimates.figures_of(posterior, tests)
     assert list(of_draws.mass) == list(of_corrected.mass) == list(limits)

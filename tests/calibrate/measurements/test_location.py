@@ -85,6 +85,20 @@ def test_points_just_outside_a_curved_wall_are_moved_onto_it(curved):
         cal.landmarks(curved, on_edges[:1] + 5e-3 * curved.mesh.size * outward[:1])
 
 
+def test_points_on_faces_edges_and_corners(ventricle, curved):
+    """Where coordinates are zero the search converges linearly; all are met to 1e-9 mm."""
+    for mesh in (ventricle.mesh, curved.mesh):
+        nodes = mesh.nodes[mesh.elements[::7]]
+        corners = np.eye(4)[[0, 1]]
+        mixed = np.array([[0.5, 0.5, 0, 0], [0, 0.2, 0.3, 0.5], [0.7, 0, 0.3, 0]])
+        for L in np.concatenate([corners, mixed]):
+            points = np.einsum("a,dai->di", shapes_at(mesh.order, L[None])[0][0], nodes)
+            elements, inside = locate(mesh, points)
+            shapes, _ = shapes_at(mesh.order, inside)
+            back = np.einsum("da,dai->di", shapes, mesh.nodes[mesh.elements[elements]])
+            np.testing.assert_allclose(back, points, atol=1e-9)
+
+
 def test_points_in_another_unit_are_refused(beam):
     """Those in metres lie inside, all at the clamp; their displacements are next to nothing."""
     points = spread_landmarks(beam, 12, 3)

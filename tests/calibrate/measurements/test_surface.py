@@ -17,7 +17,7 @@ from calibrate.measurements import (
     surface_points,
 )
 from calibrate.measurements.data import read_measurements, write_data
-from calibrate.measurements.location import closest_point, facet_shapes
+from calibrate.measurements.location import closest_points, facet_shapes
 from emulator.core.errors import InputError
 from emulator.geometry.generators.ellipsoid import human_ventricle
 
@@ -43,8 +43,9 @@ def test_the_foot_is_the_closest_point(scene, facet_set):
     facets = scene.mesh.nodes[scene.mesh.facet_set(facet_set)]
     rng = np.random.default_rng(0)
     for point in spread_on_surface(scene, facet_set, 3, seed=1) + rng.normal(0.0, 2.0, (3, 3)):
-        row, inside = closest_point(facets, point)
-        foot = facet_shapes(inside[None], facets.shape[1])[0][0] @ facets[row]
+        (row,), inside, (distance_of_foot,) = closest_points(facets, point[None])
+        foot = facet_shapes(inside, facets.shape[1])[0][0] @ facets[row]
+        assert distance_of_foot == pytest.approx(np.linalg.norm(foot - point), abs=1e-12)
 
         def distance(y, facet, point=point):
             L = np.abs(y) / np.abs(y).sum()

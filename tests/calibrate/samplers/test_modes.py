@@ -15,11 +15,12 @@ from calibrate.samplers.modes import (
     MISSED_AT,
     MISSED_BY,
     MOST,
+    climb_from,
     explore,
-    find_modes,
     heavy,
     merged,
     missed_mode,
+    modes_at,
     of_account,
     shares,
     unseen,
@@ -45,7 +46,9 @@ def density(log_density, size, spread=3.0):
 
 def missed(log_density, draws):
     of = density(log_density, draws.shape[1])
-    return missed_mode(of, {}, draws, find_modes(of, {}, prior_draws(of, KEY, 8), draws))
+    return missed_mode(
+        of, {}, draws, modes_at(of, {}, climb_from(of, {}, prior_draws(of, KEY, 8), draws))
+    )
 
 
 def test_a_climb_tells_the_width_and_the_mass_of_its_mode():

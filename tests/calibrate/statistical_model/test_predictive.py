@@ -3,8 +3,14 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
-from calibrate.statistical_model.predictive import correct, fit_correction, no_correction
+from calibrate.statistical_model.predictive import (
+    correct,
+    fit_correction,
+    gauss_newton_step,
+    no_correction,
+)
 
 
 def points(count, seed=0):
@@ -87,3 +93,19 @@ def test_errors_far_away_do_not_hide_those_of_a_narrow_posterior():
     # A finer mesh changes the errors, but neither the points nor the kernel.
     again = fit_correction(x, errors + 0.1, np.ones(2), 60, np.arange(50) < 30, like=correction)
     np.testing.assert_allclose(at(again, new), small(new) + 0.1, atol=1e-4)
+
+
+def test_a_gauss_newton_step_against_a_dense_solve():
+    """Where it is concave, the maximum of the parabola; else, with the prior's curvature there."""
+    rng = np.random.default_rng(6)
+    half, gradient, sd = rng.normal(size=(3, 3)), rng.normal(size=3), np.array([0.5, 1.0, 20.0])
+    curvature = half @ half.T + np.diag(sd**-2)
+    step, gain = gauss_newton_step(gradient, curvature, sd)
+    np.testing.assert_allclose(step, np.linalg.solve(curvature, gradient))
+    assert gain == pytest.approx(0.5 * gradient @ step)
+    short, less = gauss_newton_step(gradient, curvature, sd, 0.01)
+    assert np.linalg.norm(short / sd) == pytest.approx(0.01)
+    assert 0.0 < less < gain
+    assert less == pytest.approx(gradient @ short - 0.5 * short @ curvature @ short)
+    bent, _ = gauss_newton_step(gradient, -np.diag(sd**-2), sd)
+    np.testing.assert_allclose(bent, sd**2 * gradient)

@@ -13,9 +13,11 @@ from emulator.core import gaussian_process as kernel
 from emulator.core.gaussian_process import (
     JITTER,
     Features,
+    Regression,
     covariance,
     fit_lengths,
     fold,
+    kernel_mean,
     negative_log_likelihood,
 )
 
@@ -99,6 +101,34 @@ def test_symmetric_and_positive_definite(features):
     K = np.asarray(covariance(features))
     np.testing.assert_allclose(K, K.T, rtol=0, atol=1e-15)
     assert np.linalg.eigvalsh(K).min() > 1e-8
+
+
+@pytest.mark.parametrize("library", [np, jnp])
+def test_regression_against_dense_matrices(library):
+    """Mean of known and of unknown constant mean; NumPy in, NumPy out."""
+    rng = np.random.default_rng(4)
+    x, y, at = rng.random((8, 2)), rng.normal(size=(8, 3)), rng.random(2)
+    correlation = lambda a, b: np.exp(-0.5 * np.sum((a[:, None] - b) ** 2, axis=-1))
+    K, k = correlation(x, x) + 1e-2 * np.eye(8), correlation(x, at[None])[:, 0]
+    regression = Regression.of(library.asarray(K))
+    assert isinstance(regression.factor, np.ndarray) == (library is np)
+    np.testing.assert_allclose(regression.weights(library.asarray(y)), np.linalg.solve(K, y))
+    np.testing.assert_allclose(regression.inverse(), np.linalg.inv(K))
+    bordered = np.block([[K, np.ones((8, 1))], [np.ones((1, 8)), np.zeros((1, 1))]])
+    expected = np.linalg.solve(bordered, np.append(k, 1.0))[:8]
+    np.testing.assert_allclose(regression.kriging_weights(library.asarray(k)), expected, rtol=1e-9)
+
+
+def test_kernel_means_are_between_the_values():
+    """By the sums; at points so far away that all correlations underflow, the nearest value."""
+    rng = np.random.default_rng(5)
+    squared, values = rng.random((4, 6)) * 9.0, rng.normal(size=6)
+    w = np.exp(-0.5 * squared)
+    expected = (w * values).sum(axis=1) / w.sum(axis=1)
+    np.testing.assert_allclose(kernel_mean(squared, values), expected)
+    np.testing.assert_allclose(kernel_mean(jnp.asarray(squared), jnp.asarray(values)), expected)
+    far = 1e6 + 1e4 * np.arange(6.0)
+    assert kernel_mean(far, values) == pytest.approx(values[0])
 
 
 @jax.jit

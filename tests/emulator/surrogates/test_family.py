@@ -15,6 +15,7 @@ from studies.any_ventricle.training import PLAN, BodyRuns, family_of, train_fami
 
 import emulator as em
 from emulator.core.errors import InputError
+from emulator.core.units import MM3_PER_ML
 from emulator.fem.linear_response import (
     BULK,
     FIBRES,
@@ -22,7 +23,7 @@ from emulator.fem.linear_response import (
     linear_responses,
     pressure_force,
 )
-from emulator.geometry.facets import MM3_PER_ML, Cavity
+from emulator.geometry.facets import Cavity
 from emulator.geometry.io import write_mesh
 from emulator.geometry.mesh import Mesh
 from emulator.scenes.parameter_space import Parameter

@@ -62,14 +62,15 @@ def frames(arguments: Namespace) -> Answer:
     from calibrate.measurements.frames import frame_data
     from calibrate.state_names import states_of
     from emulator.core.errors import look_up
-    from emulator.hearts.surfaces import UNITS, read_surface
+    from emulator.core.units import IN_MM
+    from emulator.hearts.surfaces import read_surface
 
     check_folder(Path(arguments.out).parent)
     if bool(arguments.field) is bool(arguments.surface):
         raise InputError("frames: give either --surface or --field")
     if arguments.field:
         return _full_field(arguments)
-    look_up(UNITS, arguments.unit, "unit")
+    look_up(IN_MM, arguments.unit, "unit")
     states_of((word.partition("=")[0] for word in arguments.surface), "surfaces")
     surfaces = {}
     for word in arguments.surface:
@@ -78,7 +79,7 @@ def frames(arguments: Namespace) -> Answer:
             raise InputError(
                 f"--surface '{word}'; give each as SET@STATE=FILE, such as lv_endocardium@es=lv.obj"
             )
-        surfaces[name] = read_surface(path, name, UNITS[arguments.unit])
+        surfaces[name] = read_surface(path, name, IN_MM[arguments.unit])
     observe, data = frame_data(words.scene_of(arguments), surfaces, arguments.points)
     write_data(arguments.out, observe, data)
     return _measured(data, arguments.out)

@@ -38,7 +38,7 @@ class Gradients(NamedTuple):
     convex: jax.Array
 
 
-class _State(NamedTuple):
+class _GradientIterate(NamedTuple):
     k: jax.Array
     x: jax.Array
     residual: jax.Array
@@ -70,7 +70,7 @@ def conjugate_gradients(
         allowance = begin * tolerance ** (k / steps)
         return jnp.array(True) if patience is None else (k < patience) | (size <= allowance)
 
-    def step(state: _State) -> _State:
+    def step(state: _GradientIterate) -> _GradientIterate:
         image = product(state.direction)
         curvature = jnp.vdot(state.direction, image)
         convex = curvature > 0.0
@@ -80,13 +80,13 @@ def conjugate_gradients(
         preconditioned = precondition(residual)
         size = jnp.vdot(residual, preconditioned)
         direction = preconditioned + size / state.size * state.direction
-        return _State(state.k + 1, x, residual, direction, size, convex)
+        return _GradientIterate(state.k + 1, x, residual, direction, size, convex)
 
-    def running(state: _State) -> jax.Array:
+    def running(state: _GradientIterate) -> jax.Array:
         unfinished = (state.k < steps) & (state.size > enough) & state.convex
         return unfinished & on_pace(state.k, state.size)
 
-    start = _State(jnp.array(0), jnp.zeros_like(b), b, first, begin, jnp.array(True))
+    start = _GradientIterate(jnp.array(0), jnp.zeros_like(b), b, first, begin, jnp.array(True))
     state = while_loop(running, step, start)
     reduction = jnp.sqrt(jnp.abs(state.size) / jnp.where(begin > 0.0, begin, 1.0))
     return Gradients(state.x, reduction, state.convex & jnp.isfinite(state.size))

@@ -141,7 +141,7 @@ def _scaled(values: np.ndarray, moments: np.ndarray) -> np.ndarray:
     return ((values - moments[0]) / moments[1]).astype(np.float32)
 
 
-class Learned(NamedTuple):
+class FamilyEnsemble(NamedTuple):
     """Networks that have learned a family of bodies, from unlike weights; on no body.
 
     architecture : the sizes of :class:`FamilyModule`.
@@ -188,7 +188,7 @@ class FamilyNetwork:
     scene : the scene, its theta within the box of the training.
     """
 
-    learned: Learned
+    learned: FamilyEnsemble
     scene: Scene
 
     @cached_property
@@ -277,7 +277,7 @@ class FamilyNetwork:
         cls, scene: Scene, description: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
     ) -> Self:
         """Return the network with this description and these arrays, on the body of ``scene``."""
-        learned = Learned(
+        learned = FamilyEnsemble(
             architecture=read_as(Architecture, description["architecture"], "architecture"),
             members=(),
             standard=Standard(**{n: widened(a) for n, a in inside(arrays, "standard").items()}),
@@ -324,7 +324,7 @@ def physics_of(scene: Scene, parameters: tuple[Parameter, ...]) -> dict[str, Any
     }
 
 
-def _check_physics(learned: Learned, scene: Scene) -> None:
+def _check_physics(learned: FamilyEnsemble, scene: Scene) -> None:
     """Raise :class:`InputError` for other physics, or a range of theta outside the training's."""
     trained = {parameter.name: parameter for parameter in learned.parameters}
     ranges = {name: (value, value, "") for name, value in scene.constants.items()}
@@ -351,7 +351,7 @@ def _check_physics(learned: Learned, scene: Scene) -> None:
             )
 
 
-def _check_shape(learned: Learned, scene: Scene, shape: Mapping[str, float]) -> None:
+def _check_shape(learned: FamilyEnsemble, scene: Scene, shape: Mapping[str, float]) -> None:
     """Refuse a body further outside the family than a tenth of its range."""
     for name, (low, high) in learned.shapes.items():
         slack = _BEYOND * (high - low)
