@@ -194,6 +194,7 @@ class _DataPrograms:
 
     def __init__(self, model: Model) -> None:
         self.model = model
+        self._information = information_at(model, model.observe, model.noise)
         self.log_priors = jax.jit(jax.vmap(self._log_prior))
         self.answers = jax.jit(partial(jax.lax.map, self._answer, batch_size=_BATCH))
         self.log_likelihoods = jax.jit(self._log_likelihoods)
@@ -234,9 +235,8 @@ class _DataPrograms:
         parts = self.model.distributions({}, means)
         keys = jax.random.split(noise_key, len(parts))
         data = {n: d.sample(k) for (n, d), k in zip(parts.items(), keys, strict=True)}
-        information = information_at(self.model, self.model.observe, self.model.noise)
         slope = jax.grad(lambda x: self._log_likelihood(x, self._answer(x), data, error))(x)
-        return data, information(x, error, sizes), slope
+        return data, self._information(x, error, sizes), slope
 
 
 def _posterior_covariances(

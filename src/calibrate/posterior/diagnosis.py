@@ -187,6 +187,31 @@ def diagnose(
         yield ": ".join(wrong_map)
     if box:
         yield ": ".join(in_words(box))
+    yield from _chain_faults(draws, statistics, summary, wrong_map is None, bool(box))
+    yield from _weight_faults(attributes)
+    place, lighter = attributes.get(MISSED_AT), attributes.get(MISSED_BY)
+    if place is not None and lighter is not None:
+        times = float(np.exp(min(-lighter, np.log(_MANY))))
+        mass = "many times" if times >= _MANY else f"{times:.2g} times"
+        yield (
+            f"no draw is at another mode of the posterior, {place}, which has {mass} the mass of "
+            "all draws: use a sampler for several modes, such as smc, or a prior that leaves one "
+            "of them out"
+        )
+
+
+def _chain_faults(
+    draws: Mapping[str, np.ndarray],
+    statistics: Mapping[str, np.ndarray],
+    summary: Mapping[str, Mapping[str, float]],
+    right_map: bool,
+    at_an_end: bool,
+) -> Iterator[str]:
+    """Yield the faults of chains: divergences, chains that disagree, too few effective draws.
+
+    right_map : whether the map is near enough to FEM; otherwise it is mended first.
+    at_an_end : whether an end of a range ends the posterior.
+    """
     if np.any(diverging := np.asarray(statistics.get("diverging", False), bool)):
         count, share = int(diverging.sum()), 100.0 * diverging.mean()
         clusters = [place for name, v in draws.items() if (place := _where(name, v, diverging))]
@@ -198,7 +223,7 @@ def diagnose(
             "be missing. Raise target_accept towards 1, "
             + (
                 "or widen the box"
-                if box
+                if at_an_end
                 else "give more warm-up, or use a prior that leaves out what cannot be"
             )
         )
@@ -212,14 +237,18 @@ def diagnose(
             "smc is made"
         )
         disagree = f"the chains disagree about {name}, R-hat {r_hats[name]:.3f}"
-        yield f"{disagree}: {cure if wrong_map is None else MAP_FIRST}"
+        yield f"{disagree}: {cure if right_map else MAP_FIRST}"
     sizes = {n: min(row["ess_bulk"], row["ess_tail"]) for n, row in summary.items()}
     name = min(sizes, key=lambda n: sizes[n])
     if not sizes[name] >= limits.ENOUGH_ESS:
         yield (
             f"{sizes[name]:.0f} effective draws of {name}, fewer than {limits.ENOUGH_ESS:.0f}: "
-            f"quantiles are uncertain; {'take more draws' if wrong_map is None else MAP_FIRST}"
+            f"quantiles are uncertain; {'take more draws' if right_map else MAP_FIRST}"
         )
+
+
+def _weight_faults(attributes: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the faults of weighted draws: heavy tails, and modes that one population saw."""
     k, efficiency = attributes.get("pareto_k", 0.0), attributes.get("importance_efficiency", 1.0)
     if not (k <= LARGEST_PARETO_SHAPE and efficiency >= _LOWEST_EFFICIENCY):
         yield (
@@ -237,15 +266,6 @@ def diagnose(
         yield (
             f"{once} of {int(attributes['modes'])} modes were seen by one population only, so that "
             "others may be missing: sample more (--chains), or take a prior that leaves some out"
-        )
-    place, lighter = attributes.get(MISSED_AT), attributes.get(MISSED_BY)
-    if place is not None and lighter is not None:
-        times = float(np.exp(min(-lighter, np.log(_MANY))))
-        mass = "many times" if times >= _MANY else f"{times:.2g} times"
-        yield (
-            f"no draw is at another mode of the posterior, {place}, which has {mass} the mass of "
-            "all draws: use a sampler for several modes, such as smc, or a prior that leaves one "
-            "of them out"
         )
 
 

@@ -77,7 +77,7 @@ def _reader(path: Path) -> Callable[[Path], meshio.Mesh]:
         raise InputError("it has Gmsh's format 1, not 2 or 4; gmsh -save -format msh41 converts it")
     if suffix == ".vtk" and re.search(rb"DATASET\s+POLYDATA", head):
         return _read_polydata
-    readers = {".msh": _read_gmsh, ".inp": _read_abaqus, ".vtp": _read_vtp}
+    readers = {".msh": _read_gmsh, ".inp": lambda path: _AbaqusPart(path).mesh(), ".vtp": _read_vtp}
     return readers.get(suffix, _read)
 
 
@@ -154,51 +154,34 @@ def _polygons(text: bytes, suffix: str) -> meshio.Mesh:
     return meshio.Mesh(content.points, cells)
 
 
-def _read_abaqus(path: Path) -> meshio.Mesh:
-    """Return nodes, elements, sets and surfaces of an Abaqus input file with one part.
+class _AbaqusPart:
+    """The nodes, elements and sets of an Abaqus input file with one part, in words.
 
     Members of sets are numbers, ranges and sets; sets of solid elements become cell data, faces of
     elements become triangles. Coordinates are those of the part.
     """
-    nodes: dict[str, list[str]] = {}
-    elements: dict[str, dict[str, list[str]]] = {}  # by meshio's type
-    sets: dict[str, dict[str, list[Any]]] = {"NSET": {}, "ELSET": {}, "FACES": {}}
-    names: dict[str, str] = {}  # as first written: Abaqus does not mind their case
-    info: dict[str, None] = {}  # what was not understood
 
-    def numbers(kind: str, name: str) -> list[str]:
-        of_set = []
-        for word in sets[kind].get(name, [name]):
-            member = word.rpartition(".")[2].upper()  # without the instance
-            if member in sets[kind] and member != name:
-                of_set += numbers(kind, member)
-            elif member.isdigit():
-                of_set.append(member)
-            else:
-                info[f"'{word}' in {names.get(name, name)}"] = None
-        return of_set
+    def __init__(self, path: Path) -> None:
+        self.nodes: dict[str, list[str]] = {}
+        self.elements: dict[str, dict[str, list[str]]] = {}  # by meshio's type
+        self.sets: dict[str, dict[str, list[Any]]] = {"NSET": {}, "ELSET": {}, "FACES": {}}
+        self.names: dict[str, str] = {}  # as first written: Abaqus does not mind their case
+        self.unread: dict[str, None] = {}  # what was not understood, in order
+        for keyword, options, rows in _sections(path):
+            self._read(keyword, options, rows)
 
-    for keyword, options, rows in _sections(path):
+    def _read(self, keyword: str, options: dict[str, str], rows: list[list[str]]) -> None:
+        """Read the rows of one section."""
         kind, name = keyword, options.get(keyword, "")
-        members: list[Any] = [row[0] for row in rows]
+        members: list[Any] | None = [row[0] for row in rows]
         if keyword == "NODE":
             kind, name = "NSET", options.get("NSET", "")
             for number, *xyz in rows:
-                if nodes.setdefault(number, xyz) != xyz:
+                if self.nodes.setdefault(number, xyz) != xyz:
                     raise InputError(f"node {number} is at two places, as of two parts; export one")
         elif keyword == "ELEMENT":
             kind, name = "ELSET", options.get("ELSET", "")
-            code = options.get("TYPE", "").upper()
-            cell = {**_abaqus.abaqus_to_meshio_type, **_TYPES}.get(code)
-            if cell is None:
-                info[f"elements {code}"] = None
-                continue
-            words, width = [w for row in rows for w in row if w], 1 + num_nodes_per_cell[cell]
-            if len(words) % width:
-                raise InputError(f"an element {code} has not {width - 1} nodes")
-            rows = np.reshape(words, (-1, width)).tolist()
-            members = [row[0] for row in rows]
-            elements.setdefault(cell, {}).update({row[0]: row[1:] for row in rows})
+            members = self._read_elements(options.get("TYPE", "").upper(), rows)
         elif keyword == "SURFACE":
             name, of_nodes = options.get("NAME", ""), options.get("TYPE", "").upper() == "NODE"
             kind = "NSET" if of_nodes else "FACES"
@@ -208,44 +191,81 @@ def _read_abaqus(path: Path) -> meshio.Mesh:
             members = [str(k) for a, b, *by in steps for k in range(a, b + 1, *by)]
         else:
             members = [word for row in rows for word in row if word]
-            if not members and kind in sets:  # such as the nodes of an element set
-                info[f"set {name}, which has no members of its own"] = None
-        if kind in sets and name:
-            sets[kind].setdefault(name.upper(), []).extend(members)
-            names.setdefault(name.upper(), name)
-    of_set = {name: numbers("ELSET", name) for name in sets["ELSET"]}
-    corners = {k: row for of_kind in elements.values() for k, row in of_kind.items()}
-    for name, rows in sets["FACES"].items():
+            if not members and kind in self.sets:  # such as the nodes of an element set
+                self.unread[f"set {name}, which has no members of its own"] = None
+        if kind in self.sets and name and members is not None:
+            self.sets[kind].setdefault(name.upper(), []).extend(members)
+            self.names.setdefault(name.upper(), name)
+
+    def _read_elements(self, code: str, rows: list[list[str]]) -> list[str] | None:
+        """Read elements of Abaqus' type ``code`` and return their numbers; None if unread."""
+        cell = {**_abaqus.abaqus_to_meshio_type, **_TYPES}.get(code)
+        if cell is None:
+            self.unread[f"elements {code}"] = None
+            return None
+        words, width = [w for row in rows for w in row if w], 1 + num_nodes_per_cell[cell]
+        if len(words) % width:
+            raise InputError(f"an element {code} has not {width - 1} nodes")
+        elements = np.reshape(words, (-1, width)).tolist()
+        self.elements.setdefault(cell, {}).update({row[0]: row[1:] for row in elements})
+        return [row[0] for row in elements]
+
+    def numbers(self, kind: str, name: str) -> list[str]:
+        """Return the numbers of a set's members, those of sets within it included."""
+        of_set = []
+        for word in self.sets[kind].get(name, [name]):
+            member = word.rpartition(".")[2].upper()  # without the instance
+            if member in self.sets[kind] and member != name:
+                of_set += self.numbers(kind, member)
+            elif member.isdigit():
+                of_set.append(member)
+            else:
+                self.unread[f"'{word}' in {self.names.get(name, name)}"] = None
+        return of_set
+
+    def _triangles(self, name: str, corners: dict[str, list[str]]) -> dict[str, list[str]]:
+        """Return the nodes of the faces of a surface; ``corners`` has the nodes of each element."""
         faces = {
             f"{name} {k} {face}": [corners[k][c] for c in _FACES[face.upper()]]
-            for which, face in ((row[0], row[-1]) for row in rows)
-            for k in numbers("ELSET", which.upper())
+            for which, face in ((row[0], row[-1]) for row in self.sets["FACES"][name])
+            for k in self.numbers("ELSET", which.upper())
             if face.upper() in _FACES and len(corners.get(k, ())) in (4, 10)
         }
         if not faces:
-            info[f"surface {names[name]}, which has no faces S1 to S4"] = None
-        elements.setdefault("triangle", {}).update(faces)
-        of_set[name] = [*of_set.get(name, ()), *faces]
-    place = {number: k for k, number in enumerate(nodes)}
-    elements = {kind: of_kind for kind, of_kind in elements.items() if of_kind}
-    data = {}
-    for name, members in of_set.items():
-        member = {kind: np.isin([*mask], members).astype(int) for kind, mask in elements.items()}
-        lower = [mask.any() for kind, mask in member.items() if kind.startswith(("tri", "line"))]
-        data[f"set:{names[name]}" if any(lower) else names[name]] = [*member.values()]
-    return meshio.Mesh(
-        np.array([[float(word or 0) for word in xyz[:3]] for xyz in nodes.values()]),
-        {
-            kind: np.array([[place[k] for k in row] for row in of_kind.values()])
-            for kind, of_kind in elements.items()
-        },
-        cell_data=data,
-        point_sets={
-            names[name]: np.array([place[k] for k in numbers("NSET", name) if k in place], int)
-            for name in sets["NSET"]
-        },
-        info=[*info],
-    )
+            self.unread[f"surface {self.names[name]}, which has no faces S1 to S4"] = None
+        return faces
+
+    def mesh(self) -> meshio.Mesh:
+        """Return the part as meshio's mesh, with its sets."""
+        of_set = {name: self.numbers("ELSET", name) for name in self.sets["ELSET"]}
+        cells = {kind: dict(rows) for kind, rows in self.elements.items()}
+        corners = {k: row for rows in self.elements.values() for k, row in rows.items()}
+        for name in self.sets["FACES"]:
+            faces = self._triangles(name, corners)
+            cells.setdefault("triangle", {}).update(faces)
+            of_set[name] = [*of_set.get(name, ()), *faces]
+        cells = {kind: rows for kind, rows in cells.items() if rows}
+        place = {number: k for k, number in enumerate(self.nodes)}
+        data = {}
+        for name, members in of_set.items():
+            masks = {kind: np.isin([*rows], members).astype(int) for kind, rows in cells.items()}
+            lower = any(m.any() for kind, m in masks.items() if kind.startswith(("tri", "line")))
+            data[f"set:{self.names[name]}" if lower else self.names[name]] = [*masks.values()]
+        return meshio.Mesh(
+            np.array([[float(word or 0) for word in xyz[:3]] for xyz in self.nodes.values()]),
+            {
+                kind: np.array([[place[k] for k in row] for row in rows.values()])
+                for kind, rows in cells.items()
+            },
+            cell_data=data,
+            point_sets={
+                self.names[name]: np.array(
+                    [place[k] for k in self.numbers("NSET", name) if k in place], int
+                )
+                for name in self.sets["NSET"]
+            },
+            info=[*self.unread],
+        )
 
 
 def _sections(path: Path) -> Iterator[tuple[str, dict[str, str], list[list[str]]]]:
