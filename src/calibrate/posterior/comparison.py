@@ -31,11 +31,13 @@ import json
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from calibrate.arviz import stats
+from calibrate.importance.weights import smoothed
 from emulator.core.errors import InputError
 
 SURE = 2.0  # standard errors beyond which two models differ
@@ -118,18 +120,34 @@ def compare(trees: Mapping[str, xr.DataTree]) -> Comparison:
         # ArviZ's own warning of influential data; they are counted below.
         warnings.simplefilter("ignore", UserWarning)
         for name, tree in trees.items():
-            scores[name] = stats.loo(_all_data(name, tree), pointwise=True)
+            scores[name] = _leave_one_out(_all_data(name, tree))
         table = stats.compare(scores, round_to="none")
     models = []
     for name, row in table.iterrows():
         score = scores[name]
         numbers = (score.elpd, score.se, row["elpd_diff"], row["dse"], row["weight"], score.p)
         elpd, se, gap, gap_se, weight, count = map(float, numbers)
-        unreliable = int(np.sum(np.asarray(score.pareto_k) > score.good_k))
+        unreliable = int(np.sum(~(np.asarray(score.pareto_k) <= score.good_k)))  # NaN, too
         evidence = (trees[name].attrs.get(key) for key in ("log_evidence", "log_evidence_error"))
         known = (None if number is None else float(number) for number in evidence)
         models.append(Compared(str(name), elpd, se, gap, gap_se, weight, count, unreliable, *known))
     return Comparison(tuple(models), int(scores[next(iter(trees))].n_data_points))
+
+
+def _leave_one_out(data: xr.DataTree) -> Any:
+    """Return ArviZ's estimate, also where it refuses weights: a tail of equal ones stays as it is.
+
+    A datum that no parameter moves, as of a specimen at rest, is as likely at every draw.
+    """
+    try:
+        return stats.loo(data, pointwise=True)
+    except ValueError:
+        log_likelihood = data["log_likelihood"].to_dataset()["data"]
+    weights, shapes = xr.zeros_like(log_likelihood), xr.zeros_like(log_likelihood[0, 0])
+    for datum in range(log_likelihood.sizes["datum"]):
+        result, shapes[datum] = smoothed(-log_likelihood.values[..., datum].ravel())
+        weights[..., datum] = result.reshape(weights.shape[:2])
+    return stats.loo(data, pointwise=True, log_weights=weights, pareto_k=shapes)
 
 
 def _check_same_data(trees: Mapping[str, xr.DataTree]) -> None:

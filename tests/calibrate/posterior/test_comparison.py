@@ -133,6 +133,28 @@ def test_a_model_that_no_datum_fits_loses_though_its_score_is_unreliable(problem
     assert verdict.startswith("not decided: single data decide too much in hopeless")
 
 
+def test_a_datum_that_no_parameter_moves_counts_as_it_is(trees):
+    """Its likelihood is the same with and without it: a specimen at rest, with known noise."""
+    known = trees["right"].copy(deep=True)
+    known["log_likelihood"]["displacement"].values[..., 0, 0] = -0.7
+    (score,) = (m for m in compare({"a": known, "b": trees["biased"]}).models if m.name == "a")
+    rest = trees["right"].copy(deep=True)
+    rest["log_likelihood"]["displacement"].values[..., 0, 0] = 0.0
+    (without,) = (m for m in compare({"a": rest, "b": trees["biased"]}).models if m.name == "a")
+    assert score.elpd - without.elpd == pytest.approx(-0.7, abs=1e-9)
+    assert score.parameters == pytest.approx(without.parameters, abs=1e-9)
+    assert score.unreliable == 0
+
+
+def test_a_chain_that_never_moved_is_told(trees):
+    """A quarter of the draws is one draw: nothing can be said of the tail of the weights."""
+    stuck = trees["right"].copy(deep=True)
+    values = stuck["log_likelihood"]["displacement"].values
+    values[0] = values[0, :1] - 5.0
+    found = compare({"stuck": stuck, "biased": trees["biased"]})
+    assert max(model.unreliable for model in found.models) == 9
+
+
 def test_only_models_of_the_same_data(problems, trees):
     right = trees["right"]
     other = right.copy(deep=True)
