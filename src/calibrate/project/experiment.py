@@ -54,6 +54,7 @@ from emulator.core import schema
 from emulator.core.errors import InputError
 from emulator.core.gaussian_process import CORRELATIONS
 from emulator.core.schema import OneOf, Table, documented, json_schema, table_of
+from emulator.core.store import parse_text
 from emulator.surrogates.registry import FORWARD_MAPS, forward_kind, known_options
 
 if TYPE_CHECKING:
@@ -67,8 +68,9 @@ def is_experiment_file(word: str) -> bool:
     if not word.endswith(".toml") or not Path(word).is_file():
         return False
     try:
-        return bool({"scene", MEMBERS} & tomllib.loads(Path(word).read_text("utf-8")).keys())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError):
+        content = parse_text(tomllib.loads, Path(word).read_text("utf-8"))
+        return bool({"scene", MEMBERS} & content.keys())
+    except ValueError:
         return False  # the reader of scenes reports it
 
 

@@ -14,35 +14,51 @@ from typing import Any
 
 Path = tuple[str | int, ...]
 
+# Strings of several lines, whose last quotes may be their own; strings of one; comments; the rest.
+_TOML_TOKEN = re.compile(
+    r'''"""(?:\\.|[^\\])*?"{3,5}|'{3}.*?'{3,5}|"(?:\\.|[^"\\])*"|'[^']*'|#[^\n]*|[\[\]{}\n]''',
+    re.DOTALL,
+)
 _JSON_TOKEN = re.compile(r'"(?:\\.|[^"\\])*"|[\[\]{},:]')
 
 
 def toml_lines(text: str) -> dict[Path, int]:
     """Return the line of each table header and key.
 
-    The text is split into statements: a header or a key with its value, the fewest lines in a row
-    that are valid TOML by themselves.
+    The text is split into statements: a header or a key with its value, which end where a line
+    ends outside of strings and brackets.
     """
     lines: dict[Path, int] = {}
     tables: dict[Path, int] = {}  # number of tables so far in each array of tables
     table: Path = ()
-    rows: list[str] = []
-    for end, row in enumerate(text.replace("\r\n", "\n").split("\n"), start=1):
-        rows.append(row)
-        try:
-            statement = tomllib.loads("\n".join(rows))
-        except tomllib.TOMLDecodeError:
-            continue  # in the middle of a value of several lines
-        if row.lstrip().startswith("[") and len(rows) == 1:
-            table = _table(statement, tables)
+    line = 1
+    for statement in _statements(text.replace("\r\n", "\n")):
+        entries = tomllib.loads(statement)
+        if statement.lstrip().startswith("["):
+            table = _table(entries, tables)
             paths = [table]
         else:
-            paths = [table + path for path in _paths(statement)]
+            paths = [table + path for path in _paths(entries)]
         for path in paths:
             for depth in range(1, len(path) + 1):
-                lines.setdefault(path[:depth], end + 1 - len(rows))
-        rows = []
+                lines.setdefault(path[:depth], line)
+        line += statement.count("\n")
     return lines
+
+
+def _statements(text: str) -> Iterator[str]:
+    """Split a TOML text after each end of a line that is in no string and in no bracket."""
+    begin = depth = 0
+    for match in _TOML_TOKEN.finditer(text):
+        token = match.group()
+        if token in ("[", "{"):
+            depth += 1
+        elif token in ("]", "}"):
+            depth -= 1
+        elif token == "\n" and depth == 0:
+            yield text[begin : match.end()]
+            begin = match.end()
+    yield text[begin:]
 
 
 def _table(header: Any, tables: dict[Path, int]) -> Path:
@@ -70,8 +86,11 @@ def json_lines(text: str) -> dict[Path, int]:
     lines: dict[Path, int] = {}
     stack: list[str | int] = []  # key or index in each container that is open
     expects_key = False
+    line, position = 1, 0
     for match in _JSON_TOKEN.finditer(text):
-        token, line = match.group(), text.count("\n", 0, match.start()) + 1
+        token = match.group()
+        line += text.count("\n", position, match.start())
+        position = match.start()
         if token in "[{":
             stack.append(0 if token == "[" else "")
             expects_key = token == "{"

@@ -25,7 +25,7 @@ from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, core_sc
 
 from emulator.core.errors import InputError, closest, look_up
 from emulator.core.line_index import Path, json_lines, line_of, toml_lines
-from emulator.core.store import read_json
+from emulator.core.store import parse_text, read_json
 
 # ``names : text``, with its further lines indented; under a heading of its section or without one.
 _ENTRY = re.compile(r"^(\w[\w, ]*?) : (.*?)(?=^\S|^\s*$|\Z)", re.MULTILINE | re.DOTALL)
@@ -209,8 +209,8 @@ def read_toml(path: FilePath, noun: str) -> Source:
         raise InputError(f"{name} does not exist")
     try:
         text = path.read_text(encoding="utf-8")
-        return Source(name, tomllib.loads(text), toml_lines(text))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        return Source(name, parse_text(tomllib.loads, text), toml_lines(text))
+    except ValueError as error:
         raise InputError(f"{name} is not valid TOML: {error}") from error
 
 

@@ -10,7 +10,7 @@ import json
 import math
 import os
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from emulator.core.errors import InputError
+
+NESTING = 100  # levels of tables and lists; files that this package reads have fewer than ten
 
 
 @contextmanager
@@ -123,14 +125,37 @@ def exclusive(path: str | Path, what: str) -> Iterator[Path]:
                 path.parent.rmdir()
 
 
+def parse_text(parser: Callable[[str], Any], text: str) -> Any:
+    """Return what a parser of TOML or JSON makes of ``text``.
+
+    Raises ValueError, as the parser does, also where tables and lists are nested too deep.
+    """
+    too_deep = f"tables or lists are nested deeper than {NESTING} levels"
+    try:
+        content = parser(text)
+    except RecursionError:
+        raise ValueError(too_deep) from None
+    level = [content]
+    for _ in range(NESTING):
+        level = [
+            value
+            for container in level
+            if isinstance(container, dict | list)
+            for value in (container.values() if isinstance(container, dict) else container)
+        ]
+    if level:
+        raise ValueError(too_deep)
+    return content
+
+
 def read_json(path: str | Path) -> Any:
     """Return the content of a JSON file; :class:`InputError` when missing or malformed."""
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path} does not exist")
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        return parse_text(json.loads, path.read_text(encoding="utf-8"))
+    except ValueError as error:
         raise InputError(f"{path} is not valid JSON: {error}") from error
 
 

@@ -91,3 +91,16 @@ def test_a_mesh_with_a_flat_element(capsys, block):
     assert "block.vtu: element 5 has no volume, 1 such of 12" in complaint(
         capsys, "simulate", block
     )
+
+
+@pytest.mark.parametrize(
+    "value", ["[" * 20_000 + "]" * 20_000, "{a = " * 20_000 + "1" + "}" * 20_000]
+)
+def test_toml_that_is_nested_deep_is_refused_in_a_line(capsys, tmp_path, value):
+    path = tmp_path / "deep.toml"
+    path.write_text(f"scene = {value}\n")
+    for command in ("simulate", "infer"):
+        said = complaint(
+            capsys, command, path, *(["--out", tmp_path / "run"] * (command == "infer"))
+        )
+        assert "deep.toml is not valid TOML: tables or lists are nested deeper than 100" in said

@@ -9,6 +9,7 @@ from emulator.core.store import (
     inside,
     named_leaves,
     read_arrays,
+    read_json,
     replacing,
     save_arrays,
     to_json,
@@ -50,3 +51,14 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path):
 def test_json_of_arrays_has_lists_and_null():
     content = {"axis": np.array([0.0, np.nan, 1.0]), "size": (1, np.inf)}
     assert json.loads(to_json(content)) == {"axis": [0.0, None, 1.0], "size": [1, None]}
+
+
+@pytest.mark.parametrize("depth", [101, 2_000, 20_000, 200_000])
+def test_json_that_is_nested_deep_is_refused_in_a_line(tmp_path, depth):
+    path = tmp_path / "deep.json"
+    for opening, closing in (("[", "]"), ('{"a": ', "}")):
+        path.write_text(opening * depth + "1" + closing * depth)
+        with pytest.raises(InputError, match="not valid JSON: .* deeper than 100 levels"):
+            read_json(path)
+    path.write_text("[" * 99 + "1" + "]" * 99)
+    assert isinstance(read_json(path), list)
