@@ -23,6 +23,7 @@ from calibrate.local_server import LOOPBACK, Handler, Server, listen
 from calibrate.measurements import Observation, Observations, observations
 from calibrate.measurements.outputs import Outputs
 from emulator.core.errors import InputError, SolverError
+from emulator.core.store import parse_text
 from emulator.surrogates.protocol import ForwardMap
 
 NAME = "forward"
@@ -106,7 +107,9 @@ class _Fault(Exception):
 class _BridgeHandler(Handler):
     def do_GET(self) -> None:
         """Answer with the protocol's version and the model's name."""
-        if self.is_foreign() or self.path != "/Info":
+        if self.is_foreign():
+            self._refuse_foreign()
+        elif self.path != "/Info":
             self.send(404, {})
         else:
             self.send(200, {"protocolVersion": _VERSION, "models": [NAME]})
@@ -114,8 +117,12 @@ class _BridgeHandler(Handler):
     def do_POST(self) -> None:
         """Answer a request, or refuse it with the type of its error."""
         try:
-            request = json.loads(self.rfile.read(int(self.headers.get("Content-Length", 0))))
-            if self.is_foreign() or not isinstance(request, dict):
+            text = self.body()
+            if self.is_foreign():
+                self._refuse_foreign()
+                return
+            request = parse_text(json.loads, text)
+            if not isinstance(request, dict):
                 raise ValueError("not a request of this protocol")
             self.send(200, self.server.subject.answer(self.path.removeprefix("/"), request))
         except _Fault as fault:
@@ -125,8 +132,11 @@ class _BridgeHandler(Handler):
         except (ValueError, TypeError, KeyError) as error:
             self._refuse("InvalidInput", f"cannot read the request: {error}")
 
-    def _refuse(self, kind: str, message: str) -> None:
-        self.send(400, {"error": {"type": kind, "message": message}})
+    def _refuse_foreign(self) -> None:
+        self._refuse("InvalidInput", "a page of another site asks; this model answers none", 403)
+
+    def _refuse(self, kind: str, message: str, code: int = 400) -> None:
+        self.send(code, {"error": {"type": kind, "message": message}})
 
 
 def _vector(value: Any, size: int, name: str) -> np.ndarray:

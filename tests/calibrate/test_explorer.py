@@ -111,6 +111,11 @@ def test_only_this_machine(explorer, address):
         ask(address, "at", CENTRE, Host="elsewhere.example")
     with refused.value as answer:
         assert answer.code == 403
+    for headers in ({"Origin": "http://elsewhere.example"}, {"Sec-Fetch-Site": "cross-site"}):
+        with pytest.raises(urllib.error.HTTPError) as refused:
+            ask(address, "at", CENTRE, **headers)
+        with refused.value as answer:
+            assert answer.code == 403
     with serve(explorer) as server:
         assert server.server_address[0] == "127.0.0.1"
         with pytest.raises(InputError, match=r"port \d+: .*; give another, or 0"):

@@ -1,5 +1,6 @@
 """Forward maps for other programs: the protocol over HTTP, its own client, the command line."""
 
+import http.client
 import json
 import signal
 import subprocess
@@ -27,6 +28,13 @@ from calibrate.cli import main
 signal.signal(signal.SIGINT, signal.default_int_handler)
 sys.exit(main(sys.argv[1:]))
 """
+
+
+class NoError(urllib.request.HTTPErrorProcessor):
+    """Returns answers of every status."""
+
+    def http_response(self, request, response):
+        return response
 
 
 @contextmanager
@@ -147,6 +155,43 @@ def test_what_is_no_request(address):
     named = {"name": "forward"}
     assert ask(address, "InputSizes", named, Host="elsewhere.example")["type"] == "InvalidInput"
     assert ask(address, "nothing") == {}
+
+
+def test_requests_that_cannot_be_read_are_answered(address):
+    """A length below 0 was read to an end that never comes; deep lists overflowed the stack."""
+    for length in ("-1", "x", "9" * 12, ""):
+        connection = http.client.HTTPConnection(address.removeprefix("http://"), timeout=20)
+        connection.putrequest("POST", "/Evaluate")
+        connection.putheader("Content-Length", length)
+        connection.endheaders()
+        answer = connection.getresponse()
+        assert answer.status == 400
+        assert f"Content-Length is {length}; give" in json.loads(answer.read())["error"]["message"]
+        connection.close()
+    for deep in (b"[" * 20_000, b'{"a": ' * 20_000 + b"1" + b"}" * 20_000, b"[" * 10**6):
+        error = ask(address, "Evaluate", deep)
+        assert error["type"] == "InvalidInput"
+        assert "\n" not in error["message"]
+
+
+@pytest.mark.parametrize(
+    ("headers", "code"),
+    [
+        ({}, 200),
+        ({"Origin": "{address}"}, 200),
+        ({"Origin": "http://elsewhere.example"}, 403),
+        ({"Origin": "http://127.0.0.1:1"}, 403),
+        ({"Origin": "null"}, 403),
+        ({"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "no-cors"}, 403),
+        ({"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate"}, 200),
+    ],
+)
+def test_pages_of_other_sites_are_refused(address, headers, code):
+    headers = {name: value.format(address=address) for name, value in headers.items()}
+    for what, data in (("Info", None), ("InputSizes", b'{"name": "forward"}')):
+        request = urllib.request.Request(f"{address}/{what}", data=data, headers=headers)
+        with urllib.request.build_opener(NoError).open(request, timeout=60) as answer:
+            assert answer.status == code
 
 
 def test_no_answer_is_an_error_not_a_number(beam):
