@@ -99,13 +99,14 @@ def sample_population(
     alone : the sampler of each member alone, or draws of each member alone.
     checkpoint : the file of the run's state, as of :func:`calibrate.sample`.
     """
-    options = check_options(NUTS, options or NUTSOptions(target_accept=TARGET_ACCEPT))
+    options = options or NUTSOptions(target_accept=TARGET_ACCEPT)
+    density = density_of_population(model)
+    options = check_options(NUTS, options, density.dimension)
     if isinstance(alone, str):
         by_member, sampler = _alone(model, data, alone, seed, progress=progress), alone
     else:
         by_member, sampler = {m: dict(alone[m]) for m in model.members}, "given"
     information = _information(model, by_member, data)
-    density = density_of_population(model)
     provenance = _provenance(model, options, sampler, seed)
     arrays = {
         f"{kind} {member} {name}": values

@@ -241,8 +241,10 @@ def sample(
         or of which all values are missing, a checkpoint of another run.
     """
     method = find_sampler(sampler, options)
-    options = check_options(method, options)
     model, checked = model.given(data)
+    # Of each datum, the log likelihood and a replicate.
+    kept = len(model.names) + 2 * predictions * sum(np.size(values) for values in checked.values())
+    options = check_options(method, options, kept)
     record = provenance(model, seed, method.name, options)
     # The scene's place is no matter. Messages name the first difference, so what a user changes
     # most comes first.

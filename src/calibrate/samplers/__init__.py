@@ -14,6 +14,7 @@ from calibrate.samplers.protocol import ChainOptions, Context, Draws, Kernel, Sa
 from calibrate.samplers.smc import SMC, SMCOptions
 from calibrate.statistical_model.density import Density, density_of, named_draws
 from emulator.core.errors import InputError, look_up
+from emulator.core.machine import memory
 from emulator.core.schema import Source, parse, table_of
 
 _ALL: tuple[Sampler, ...] = (AUTO, IMPORTANCE, NUTS, BLACKJAX_NUTS, SMC, LAPLACE)
@@ -57,20 +58,28 @@ def find_sampler(name: str | None, options: Any | None = None) -> Sampler:
     return look_up(SAMPLERS, name, "sampler")
 
 
-def check_options(sampler: Sampler, options: Any | None) -> Any:
+def check_options(sampler: Sampler, options: Any | None, numbers: int) -> Any:
     """Return ``options``, or the sampler's defaults for ``None``.
+
+    numbers : the float64 numbers that are kept of each draw.
 
     Raises
     ------
     InputError
-        The options are those of another sampler.
+        The options are those of another sampler, or ask for more draws than memory has room for.
     """
-    if options is None:
-        return sampler.options()
+    options = sampler.options() if options is None else options
     if type(options) is not sampler.options:
         raise InputError(
             f"sampler '{sampler.name}' takes {sampler.options.__name__}, "
             f"not {type(options).__name__}"
+        )
+    count = options.draws * options.chains
+    if (size := 8.0 * count * numbers) > memory():
+        most = memory() / (8.0 * options.chains * numbers)
+        raise InputError(
+            f"{options.chains} x {options.draws} draws take {size / 1e9:.3g} GB, and there are "
+            f"{memory() / 1e9:.3g}; give fewer than {most:.2g} draws"
         )
     return options
 

@@ -12,6 +12,7 @@ Names say which state is meant, ``pressure@p8`` (:mod:`calibrate.state_names`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -138,6 +139,8 @@ def _entries(
         if state and state not in states:
             listed = ", ".join(filter(None, states)) or "none; nothing is observed at a state"
             raise InputError(f"'{name}': load state '{state}' is unknown; known: {listed}")
+        if not math.isfinite(known.get(name, 0.0)):
+            raise InputError(f"known: '{name}' is {known[name]}; give a finite number")
         if state:
             by_state.add(parameter)
 

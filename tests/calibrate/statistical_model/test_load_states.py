@@ -54,6 +54,7 @@ def test_what_a_prior_does_not_name_has_the_box_and_a_state_goes_before_all(vent
     ("prior", "known", "message"),
     [
         (None, {"pressure@top": 1.0}, "load state 'top' is unknown; known: low, high"),
+        (None, {"a": float("nan")}, "known: 'a' is nan; give a finite number"),
         (None, {"presure": 1.0}, "has no parameter 'presure'; it has a, b, a_f, b_f, pressure"),
         ({"a": dist.Uniform(0.1, 0.5)}, {"a": 0.3}, "'a' is known and has a prior"),
         (None, {**MATERIAL, "pressure": 1.0}, "every parameter is known; leave one"),
