@@ -118,7 +118,10 @@ def exclusive(path: str | Path, what: str) -> Iterator[Path]:
     try:
         yield path
     finally:
-        Path(lock.lock_file).unlink(missing_ok=True)
+        # Removed while locked: another process that has opened it already finds, once it has the
+        # lock, that the file has no name any more, and opens a new one (filelock 4.2 and later).
+        with suppress(OSError):  # Windows removes no open file
+            Path(lock.lock_file).unlink()
         lock.release()
         if new:
             with suppress(OSError):  # raises where the folder is not empty

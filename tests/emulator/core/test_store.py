@@ -1,4 +1,6 @@
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -62,3 +64,30 @@ def test_json_that_is_nested_deep_is_refused_in_a_line(tmp_path, depth):
             read_json(path)
     path.write_text("[" * 99 + "1" + "]" * 99)
     assert isinstance(read_json(path), list)
+
+
+EXCLUDE = """
+import os, sys, time
+from emulator.core.errors import InputError
+from emulator.core.store import exclusive
+folder, count, end = sys.argv[1], 0, time.monotonic() + 2.0
+while time.monotonic() < end or not count:
+    try:
+        with exclusive(folder + "/run.json", "run"):
+            os.close(os.open(folder + "/mark", os.O_CREAT | os.O_EXCL))  # raises where it is there
+            os.unlink(folder + "/mark")
+            count += 1
+    except InputError:
+        pass
+"""
+
+
+def test_two_processes_are_never_both_inside(tmp_path):
+    """Each takes the lock thousands of times, and removes its file while the other may open it."""
+    (tmp_path / "keep").touch()
+    words = [sys.executable, "-c", EXCLUDE, str(tmp_path)]
+    pair = [subprocess.Popen(words, stderr=subprocess.PIPE, text=True) for _ in range(2)]
+    for process in pair:
+        _, said = process.communicate(timeout=60)
+        assert process.returncode == 0, said
+    assert [path.name for path in tmp_path.iterdir()] == ["keep"]
