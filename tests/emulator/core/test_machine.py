@@ -94,3 +94,47 @@ def test_blas_is_held_to_one_thread_and_let_go():
     with machine.one_blas_thread():
         assert threads() == {1}
     assert threads() == before
+
+
+@pytest.mark.parametrize(
+    ("groups", "files", "cores", "memory"),
+    [
+        (
+            "0::/job/step\n",
+            {"job/cpu.max": "150000 100000", "job/step/memory.max": "4096"},
+            1,
+            4096,
+        ),
+        ("0::/job\n", {"job/cpu.max": "50000 100000", "job/memory.max": "max"}, 1, None),
+        ("0::/../host\n", {"cpu.max": "max 100000", "memory.max": "8192\n"}, None, 8192),
+        (
+            "5:cpu,cpuacct:/a\n3:memory:/a\n1:name=systemd:/a\n",
+            {
+                "cpu,cpuacct/a/cpu.cfs_quota_us": "100000",
+                "cpu,cpuacct/a/cpu.cfs_period_us": "100000",
+                "memory/a/memory.limit_in_bytes": "9223372036854771712",
+                "memory/memory.limit_in_bytes": "2048",
+            },
+            1,
+            2048,
+        ),
+        (
+            "5:cpu:/\n",
+            {"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "100000"},
+            None,
+            None,
+        ),
+    ],
+)
+def test_limits_of_a_container(monkeypatch, tmp_path, groups, files, cores, memory):
+    """Control groups of versions 2 and 1: quota over period, rounded down, and bytes."""
+    (tmp_path / "none").write_text("")
+    monkeypatch.setattr(machine, "PROCESS_GROUPS", tmp_path / "none")
+    free = machine.cores(), machine.memory()
+    (tmp_path / "process").write_text(groups)
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    monkeypatch.setattr(machine, "PROCESS_GROUPS", tmp_path / "process")
+    monkeypatch.setattr(machine, "GROUPS", tmp_path)
+    assert (machine.cores(), machine.memory()) == (cores or free[0], memory or free[1])
