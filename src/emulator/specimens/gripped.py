@@ -156,10 +156,11 @@ class GrippedSpecimen:
         u = self.homogeneous.solve(theta).require_converged("the specimen").displacement
         even = np.asarray(homogeneous_stresses(self.specimen, u, theta)[1])
         sizes = np.sqrt(np.sum(even**2, axis=(1, 2)))
-        solved = {name: _spread(rows, sizes) for name, rows in self.states.protocols.items()}
+        paths, protocols = self.states.paths, self.states.protocols
+        solved = {name: _spread(rows, sizes, paths) for name, rows in protocols.items()}
         P = self.stresses(theta, np.concatenate(list(solved.values())))
-        shares, paths = np.full_like(P, np.nan), self.states.paths
-        for name, rows in self.states.protocols.items():
+        shares = np.full_like(P, np.nan)
+        for name, rows in protocols.items():
             known = solved[name]
             own = (P[known] - even[known]) / sizes[known, None, None]
             acting = self.pieces[name].acting
@@ -219,12 +220,16 @@ class GrippedSpecimen:
         raise SolverError("the gripped specimen: its grips do not come to the measured stretch")
 
 
-def _spread(rows: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+def _spread(rows: np.ndarray, sizes: np.ndarray, paths: np.ndarray) -> np.ndarray:
     """Return the states of a test that are solved: the ends of its loaded part, and some between.
 
+    Of states between which the test was held still, it is the first.
+
     sizes : the norms (m,) of all homogeneous stresses.
+    paths : the way (m,) of each state from the beginning of its test.
     """
     loaded = rows[sizes[rows] > 1e-6 * sizes.max()]
+    loaded = loaded[np.unique(paths[loaded], return_index=True)[1]]
     at = np.linspace(0, len(loaded) - 1, min(len(loaded), _MOST_STATES)).round().astype(int)
     return loaded[at]
 

@@ -112,6 +112,19 @@ def test_states_between_those_that_are_solved(strip):
     np.testing.assert_allclose(found, exact, rtol=2e-4, atol=1e-9)
 
 
+def test_a_test_that_was_held_still(strip):
+    """States that repeat without motion have the shares of their first."""
+    held = specimen(
+        {"stretch_x": np.array([1.0, 1.05, 1.05, 1.1, 1.2, 1.2])},
+        grips=clamped().grips,
+        **ISOTROPIC,
+    )
+    shares = strip.shares(THETA)[:, :, 0]
+    np.testing.assert_allclose(
+        GrippedSpecimen(held).shares(THETA)[:, :, 0], shares[[0, 1, 1, 2, 3, 3]], atol=1e-9
+    )
+
+
 @pytest.fixture(scope="module")
 def learned(strip):
     return learn_grips(strip.specimen, 20)
