@@ -16,6 +16,7 @@ certificate speaks about that run and that map, so any difference is refused.
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -50,6 +51,7 @@ MEMBERS = "members"  # entry of a population's members in run.json, and folder o
 _RESULTS = (REPORT, CERTIFICATE, POSTERIOR, FORWARD, ERROR)  # files of a run that has ended
 _PLACES = ("scene", "root", "emulator")  # may change: fingerprints identify the content
 _DESCRIPTION = "systematic"  # metadata of a file of systematic errors
+_DATA_HASH = "data_sha256"  # attribute of a posterior: the SHA-256 of its data file
 _SHOWN = 4  # largest number of a folder's files that an error names
 
 
@@ -78,7 +80,7 @@ def save_results(folder: Path, problem: Problem, posterior: Posterior) -> None:
         if (error := posterior.model.error).terms:
             metadata = {_DESCRIPTION: json.dumps(error.words)} if error.words else {}
             save_arrays(new / ERROR, error.arrays(), metadata)
-        posterior.tree.attrs["run"] = json.dumps(run)
+        posterior.tree.attrs |= {"run": json.dumps(run), _DATA_HASH: _hash(new / DATA)}
         posterior.save(new / POSTERIOR)
         # Earlier results go first and the posterior comes last: a run that is killed leaves no
         # posterior, rather than one beside the certificate of another.
@@ -136,6 +138,12 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
     if tree.attrs.get("scene_fingerprint") != scene.fingerprint:
         raise InputError(f"{path} was made for another scene than '{run.scene}'")
     _check_run(path, tree, read_json(folder / RUN))
+    kept = tree.attrs.get(_DATA_HASH)  # runs of earlier versions have none
+    if kept and (folder / DATA).is_file() and kept != _hash(folder / DATA):
+        raise InputError(
+            f"{folder / DATA} was edited after {path} was sampled with it; restore it, or infer "
+            "again with the new data"
+        )
     forward = registry.restore_forward(
         run.forward, ingredients(run, scene), run.forward_options, folder / FORWARD
     )
@@ -156,6 +164,10 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
         {n: np.asarray(observed[n]).reshape(shape) for n, shape in observe.shapes.items()}
     )
     return run, Posterior(tree, run_model, data)
+
+
+def _hash(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def holds_population(folder: str | Path) -> bool:

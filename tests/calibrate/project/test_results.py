@@ -167,6 +167,22 @@ def test_two_runs_do_not_share_a_folder(folder):
     assert not list(folder.glob("*.lock"))
 
 
+def test_data_that_were_edited_after_the_run(folder, capsys):
+    """Certificate and report would be of other numbers than the folder shows."""
+    path = folder / "data.csv"
+    before = path.read_bytes()
+    path.write_bytes(before.replace(b"1", b"2", 1))
+    assert "data.csv was edited after" in refusal(folder, capsys)
+    assert main(["report", str(folder), "--no-fem"]) == 2
+    assert "infer again with the new data" in capsys.readouterr().err
+    path.write_bytes(before)
+    tree = read_tree(folder / "posterior.nc")
+    del tree.attrs["data_sha256"]
+    tree.to_netcdf(folder / "posterior.nc", engine="h5netcdf")
+    path.write_bytes(before.replace(b"1", b"2", 1))
+    read_posterior(folder)  # a run of an earlier version
+
+
 @pytest.mark.slow
 def test_a_reweighted_posterior_is_kept_and_certified_like_any_other(infer_once, tmp_path, capsys):
     source, target = tmp_path / "s", tmp_path / "t"
