@@ -140,7 +140,9 @@ def test_a_result_is_replaced_at_once_or_not_at_all(infer_once, folder, monkeypa
     with monkeypatch.context() as patch:
         full = OSError(errno.ENOSPC, "No space left on device")
         patch.setattr("emulator.core.store.os.fsync", Mock(side_effect=[None, full]))
-        with pytest.raises(OSError, match="No space left on device: '.*run.json'"):
+        with pytest.raises(
+            OSError, match="No space left on device; make room and repeat.*run.json'"
+        ):
             infer(RUN, folder, force=True)
     there = {path.name for path in folder.iterdir()}
     assert there == {*before, "certificate.json", "error.safetensors"}
@@ -149,6 +151,13 @@ def test_a_result_is_replaced_at_once_or_not_at_all(infer_once, folder, monkeypa
     # Nothing stays of the earlier one that the new one does not have.
     assert {path.name for path in folder.iterdir()} == set(before)
     read_posterior(folder)
+
+
+def test_a_full_disk_is_told_before_the_draws_are_made(tmp_path, monkeypatch):
+    monkeypatch.setattr("calibrate.project.calibration.disk_usage", lambda _: Mock(free=1000))
+    with pytest.raises(InputError, match=r"the draws take 0.0166 MB, and the disk has 0.001 free"):
+        infer(RUN, tmp_path / "r")
+    assert not (tmp_path / "r").exists()
 
 
 def test_results_that_are_there_are_not_replaced(folder):
