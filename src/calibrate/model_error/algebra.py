@@ -43,7 +43,7 @@ def check_algebra(
         if known and each.priors:
             raise InputError(
                 f"{what}: the noise of {name} must be of known sd; {', '.join(each.priors)} is "
-                "inferred"
+                f"inferred; give a number, as in --noise {name}=SD"
             )
     if len(sizes) > 1:
         reasons = " and ".join(sorted(sizes))

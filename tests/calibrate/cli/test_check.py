@@ -38,7 +38,7 @@ def test_what_data_would_determine(capsys):
         (["check", "sbc", *BEAM, "--true-noise", "volume=1"], "'volume' is not observed"),
         (
             ["identify", "before", *BEAM, "--noise-scale", "1"],
-            "must be of known sd; noise_sd is inferred",
+            "noise_sd is inferred; give a number, as in --noise displacement=SD",
         ),
         (["identify", "after", "nowhere"], "nowhere"),
     ],
