@@ -17,8 +17,13 @@ class SolverError(RuntimeError):
 
 
 def closest(name: object, known: Iterable[str]) -> str:
-    """Return "; did you mean 'x'?" for the known name most like ``name``, or nothing."""
-    close = get_close_matches(str(name), list(known), 1)
+    """Return "; did you mean 'x'?" for the known name most like ``name``, or nothing.
+
+    It is the first of which ``name`` is one of the words joined by underscores, if there is one.
+    """
+    known = list(known)
+    close = [other for other in known if str(name) in other.split("_")]
+    close = close or get_close_matches(str(name), known, 1)
     return f"; did you mean '{close[0]}'?" if close else ""
 
 

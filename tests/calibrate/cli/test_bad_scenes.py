@@ -21,6 +21,7 @@ def block(tmp_path):
         ("lam = 30.0", "nu = 0.3", "parameter 'nu' is not one of law 'neo_hookean'"),
         ('law = "neo_hookean"', 'law = "guccione"', "law 'guccione' needs fibres"),
         ('kind = "gravity"', 'kind = "weight"', 'kind = "weight"; expected'),
+        ('kind = "gravity"', 'kind = "pressure"', "; did you mean 'cavity_pressure'?"),
         (
             'node_set = "left"',
             'node_set = "left"\nglue = 1',
