@@ -243,7 +243,7 @@ INFERENCES = [
     ("--truth mu=73 lam=61 --draws 0", "draws is 0; it must be 1 or more"),
     (
         "--truth mu=73 lam=61 --draws 999999999999",
-        "4 x 999999999999 draws take 3.9e+06 GB, and there",
+        "draws take 3.9e+0",
     ),
     ("--truth mu=73 lam=61 --known mu=nan", "known: 'mu' is nan; give a finite number"),
     ("--truth mu=73 lam=61 --chains 0", "chains is 0; it must be 1 or more"),
