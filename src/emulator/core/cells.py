@@ -127,12 +127,31 @@ def _check_marks(path: Path, rows: Mapping[int, Mapping[str, str]], *, decimal_c
         )
 
 
+_HEAD = 100  # lines at most before the columns of another program's file
+_OF_PROGRAMS = (
+    (
+        re.compile("COORDINATE_X.*DISPLACEMENT_X"),
+        "a frame of DICe, in pixels with y down: write its points as point,x,y and those of all "
+        "frames as frame,point,ux,uy, in mm with y up, without those whose SIGMA is -1",
+    ),
+    (
+        re.compile(r"\A\*(Step|Title|Time)\s*="),
+        "a log of FEBio: write its lines below *Data as a table with names of columns, a frame or "
+        "a state in each row",
+    ),
+)
+"""Files of other programs by what their first lines have, and how to make a table of them."""
+
 Raw = tuple[list[str], list[list[str]], bool]
 """Header, rows of cells, and whether numbers may have decimal commas."""
 
 
 def _of_text(path: Path) -> Raw:
     lines = _lines(path)
+    head = "\n".join(lines[:_HEAD])
+    for form, remedy in _OF_PROGRAMS:
+        if form.search(head):
+            raise InputError(f"data file {path} is {remedy}")
     header = re.sub(r'"[^"]*"', "", lines[0]) if lines else ""  # quoted text does not count
     delimiter = next((mark for mark in ";\t" if mark in header), ",")
     try:

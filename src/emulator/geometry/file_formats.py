@@ -75,6 +75,13 @@ def _reader(path: Path) -> Callable[[Path], meshio.Mesh]:
     suffix = path.suffix.lower()
     if suffix == ".msh" and head.lstrip().startswith(b"$NOD"):
         raise InputError("it has Gmsh's format 1, not 2 or 4; gmsh -save -format msh41 converts it")
+    if suffix == ".feb" or b"<febio_spec" in head:
+        raise InputError("it is FEBio's; FEBio Studio exports the mesh as .vtk")
+    if suffix in (".pts", ".elem", ".lon"):
+        name = path.with_suffix("").name
+        raise InputError(
+            f"it is openCARP's; meshtool convert -imsh={name} -omsh={name} -ofmt=vtk makes a .vtk"
+        )
     if suffix == ".vtk" and re.search(rb"DATASET\s+POLYDATA", head):
         return _read_polydata
     readers = {".msh": _read_gmsh, ".inp": lambda path: _AbaqusPart(path).mesh(), ".vtp": _read_vtp}

@@ -105,3 +105,22 @@ def test_toml_that_is_nested_deep_is_refused_in_a_line(capsys, tmp_path, value):
             capsys, command, path, *(["--out", tmp_path / "run"] * (command == "infer"))
         )
         assert "deep.toml is not valid TOML: tables or lists are nested deeper than 100" in said
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        (
+            "frame.txt",
+            "***\n*** Step size: x 40\n***\nCOORDINATE_X,COORDINATE_Y,DISPLACEMENT_X\n1,2,3\n",
+            "frame.txt is a frame of DICe, in pixels with y down: write its points as point,x,y",
+        ),
+        ("log.txt", "*Step = 1\n*Time = 0.1\n*Data = x;y\n1 0.5 0.5\n", "is a log of FEBio: write"),
+        ("m.feb", "<febio_spec/>", "it is FEBio's; FEBio Studio exports the mesh as .vtk"),
+        ("m.vtu", '<?xml version="1.0"?><febio_spec/>', "it is FEBio's"),
+        ("m.pts", "1\n0 0 0\n", "it is openCARP's; meshtool convert -imsh=m -omsh=m -ofmt=vtk"),
+    ],
+)
+def test_files_of_other_programs_are_named(capsys, tmp_path, name, text, message):
+    (tmp_path / name).write_text(text)
+    assert message in complaint(capsys, "init", tmp_path / name)
