@@ -4,6 +4,7 @@ import meshio
 import numpy as np
 import pytest
 
+import emulator as em
 from cli_support import SCENE, answer, complaint, write_block
 from emulator.geometry.generators.box import box
 
@@ -124,3 +125,15 @@ def test_toml_that_is_nested_deep_is_refused_in_a_line(capsys, tmp_path, value):
 def test_files_of_other_programs_are_named(capsys, tmp_path, name, text, message):
     (tmp_path / name).write_text(text)
     assert message in complaint(capsys, "init", tmp_path / name)
+
+
+def test_a_heart_that_its_own_weight_would_bend_far(capsys, tmp_path):
+    """A mesh without sets gets no other load; upright it hangs still, on its side it does not."""
+    body = em.find_scene("left_ventricle").mesh
+    for name, axes, notes in (("upright", [0, 1, 2], 0), ("lying", [2, 0, 1], 1)):
+        nodes = 93.0 / 85.0 * np.asarray(body.nodes)[:, axes]
+        path = tmp_path / f"{name}.vtu"
+        meshio.write(path, meshio.Mesh(nodes, [("tetra10", np.asarray(body.elements))]))
+        _, result = answer(capsys, "init", path)
+        fall = [note for note in result["notes"] if "its own weight moves it by 18" in note]
+        assert len(fall) == notes

@@ -19,7 +19,11 @@ from emulator.core.errors import InputError
 from emulator.core.store import check_folder, to_json
 
 if TYPE_CHECKING:
+    from emulator.scenes.scene import Scene
     from emulator.specimens.tube import Tube
+
+_SOLVED_SOON = 20_000  # nodes of a mesh on which a solve takes seconds
+_FAR = 0.15  # of the body's length
 
 
 @command(
@@ -52,6 +56,7 @@ def init(arguments: Namespace) -> Answer:
         raise InputError("--tube is for a table of stretches and pressures, not for a mesh")
     draft = draft_scene(arguments.mesh, out, unit=arguments.unit, law=arguments.law)
     scene, mesh = draft.scene, draft.scene.mesh
+    notes = [*draft.notes, *_weight_notes(scene)]
     facets = {name: len(rows) for name, rows in mesh.facet_sets.items()}
     result = {
         "out": str(draft.path),
@@ -61,17 +66,37 @@ def init(arguments: Namespace) -> Answer:
         "facet_sets": facets,
         "law": scene.law.name,
         "parameters": list(scene.parameter_names),
-        "notes": list(draft.notes),
+        "notes": notes,
     }
     sets = [f"{n} ({k} facets)" for n, k in facets.items()]
     sets += [f"{n} ({len(k)} nodes)" for n, k in mesh.node_sets.items() if n not in facets]
     lines = [
         f"{len(mesh.nodes)} nodes, {len(mesh.elements)} tetrahedra",
         f"sets: {', '.join(sets) or 'none'}",
-        *draft.notes,
+        *notes,
         f"written to {draft.path}; look for CHANGE in it, then: calibrate simulate {draft.path}",
     ]
     return Answer(result, "\n".join(lines))
+
+
+def _weight_notes(scene: Scene) -> Iterator[str]:
+    """Say how far its own weight, the load for lack of another, moves a body that is too soft."""
+    import numpy as np
+
+    from emulator.fem import Simulator
+
+    nodes = scene.mesh.nodes
+    if scene.load_parameters or len(nodes) > _SOLVED_SOON:  # a guessed pressure is a parameter
+        return
+    remedy = "raise the ranges of its moduli, hold it elsewhere, or give the load that you know"
+    solution = Simulator(scene).solve(scene.centre)
+    if not solution.converged:
+        yield f"CHANGE: FEM finds no equilibrium under its own weight: {remedy}"
+        return
+    fall = float(np.linalg.norm(solution.displacement, axis=1).max())
+    size = float(np.ptp(nodes, axis=0).max())
+    if fall > _FAR * size:
+        yield f"CHANGE: its own weight moves it by {fall:.3g} of {size:.3g} mm: {remedy}"
 
 
 def _init_specimen(table_path: Path, out: str | Path, arguments: Namespace) -> Answer:
