@@ -140,8 +140,8 @@ class GrippedSpecimen:
         theta = jnp.asarray(theta, dtype=float)
         P = np.full(self.states.gradients.shape, np.nan)
         for name, test in self.states.protocols.items():
-            own = test if rows is None else test[np.isin(test, rows)]
-            for row, at in zip(own, self.path(name, theta, own), strict=True):
+            selection = test if rows is None else test[np.isin(test, rows)]
+            for row, at in zip(selection, self.path(name, theta, selection), strict=True):
                 P[row] = self._force(self.pieces[name], theta, at)
         return P
 
@@ -161,11 +161,11 @@ class GrippedSpecimen:
         shares, paths = np.full_like(P, np.nan), self.states.paths
         for name, rows in self.states.protocols.items():
             known = solved[name]
-            own = (P[known] - even[known]) / sizes[known, None, None]
+            excess = (P[known] - even[known]) / sizes[known, None, None]
             acting = self.pieces[name].acting
             if len(known) > 1:
-                own = PchipInterpolator(paths[known], np.where(acting, own, 0.0))(paths[rows])
-            shares[rows] = np.where(acting, own, np.nan)
+                excess = PchipInterpolator(paths[known], np.where(acting, excess, 0.0))(paths[rows])
+            shares[rows] = np.where(acting, excess, np.nan)
         return shares
 
     def path(
@@ -177,15 +177,15 @@ class GrippedSpecimen:
 
         :class:`SolverError` where FEM does not converge in one of them.
         """
-        piece, own = self.pieces[test], self.states.protocols[test] if rows is None else rows
-        at = GrippedState(np.zeros(len(piece.moved)), self.simulators[piece].rest, None)
-        found = []
-        for H in self.states.gradients[own]:
+        piece, selection = self.pieces[test], self.states.protocols[test] if rows is None else rows
+        at = GrippedState(np.zeros(len(piece.components)), self.simulators[piece].rest, None)
+        path = []
+        for H in self.states.gradients[selection]:
             target = H[piece.rows, piece.columns]
             if target.any():
                 at = self._follow(piece, jnp.asarray(theta, dtype=float), target, at)
-            found.append(at)
-        return found
+            path.append(at)
+        return path
 
     def _force(self, piece: Piece, theta: jax.Array, at: GrippedState) -> np.ndarray:
         """Return the stress (3, 3) in kPa that acts on the grips."""
@@ -253,16 +253,16 @@ def learn_grips(
             return None
 
     with counting(total=runs, desc="gripped FEM", disable=not progress, unit="run") as bar:
-        found = []
+        outcomes = []
         for shares in in_order(solve, iter(thetas), gripped.workers):
-            found.append(shares)
+            outcomes.append(shares)
             bar.update()
-    rows = np.array([k for k, shares in enumerate(found) if shares is not None], dtype=int)
+    rows = np.array([k for k, shares in enumerate(outcomes) if shares is not None], dtype=int)
     if len(rows) < _FEWEST:
         raise InputError(
             f"FEM of the gripped piece converged at {len(rows)} of {runs} theta; narrow the ranges"
         )
-    shares = np.stack([each for each in found if each is not None])
+    shares = np.stack([values for values in outcomes if values is not None])
     flat = np.nan_to_num(shares.reshape(len(rows), -1))
     samples = Samples(np.asarray(specimen.to_unit(thetas[rows])), flat, np.zeros(len(rows)))
     degree, error = _best(samples, ~np.isnan(shares[0]).ravel())
@@ -295,6 +295,6 @@ def of_grips(specimen: Specimen) -> str:
     grips = specimen.grips
     assert grips is not None
     apart = ("size", "learned")  # an array of its own, and what the hash is kept with
-    words = tuple(getattr(grips, each.name) for each in fields(grips) if each.name not in apart)
+    words = tuple(getattr(grips, field.name) for field in fields(grips) if field.name not in apart)
     free = replace(specimen, grips=None)
     return fingerprint_of("grips", free.fingerprint, repr(words), np.asarray(grips.size))

@@ -166,9 +166,11 @@ def specimen(
     tube : the sector of a tube whose motion ``given`` is, see :mod:`emulator.specimens.tube`.
     entries : the other fields of a :class:`Specimen`.
     """
-    if not isinstance(given, States):
-        given = states_in(given, tube=tube, ordered=ordered)
-    return Specimen(states=given, tube=tube, **{"name": "specimen", **entries})
+    return Specimen(
+        states=given if isinstance(given, States) else states_in(given, tube=tube, ordered=ordered),
+        tube=tube,
+        **{"name": "specimen", **entries},
+    )
 
 
 def require_specimen(problem: ForwardProblem) -> Specimen:
@@ -227,8 +229,8 @@ def _likely(words: Sequence[str]) -> str:
     renamed = []
     for word in words:
         name, unit = with_unit(word)
-        found = _CONVENTION.fullmatch(name)
-        if found is not None:
-            own = "stretch" if found[1] in ("lambda", "λ") else "cauchy"
-            renamed.append(f"{word} {own}_{found[2][0].lower()}{f' [{unit}]' if unit else ''}")
+        match = _CONVENTION.fullmatch(name)
+        if match is not None:
+            quantity = "stretch" if match[1] in ("lambda", "λ") else "cauchy"
+            renamed.append(f"{word} {quantity}_{match[2][0].lower()}{f' [{unit}]' if unit else ''}")
     return f"; call {', '.join(renamed)} if they are that" if renamed else ""
