@@ -316,9 +316,11 @@ def of_each(errors: Errors, means: Mapping[str, jax.Array]) -> ModelError:
     """Return the errors of all data sets, stacked along a leading axis; means (r, ...) by name."""
     arrays = {name: np.asarray(values) for name, values in means.items()}
     count = len(next(iter(arrays.values())))
-    each = [errors({name: values[k] for name, values in arrays.items()}) for k in range(count)]
-    leaves = zip(*(jax.tree.leaves(error) for error in each), strict=True)
-    return jax.tree.unflatten(jax.tree.structure(each[0]), [_stacked(alike) for alike in leaves])
+    data_sets = ({name: values[k] for name, values in arrays.items()} for k in range(count))
+    model_errors = [errors(data) for data in data_sets]
+    leaves = zip(*map(jax.tree.leaves, model_errors), strict=True)
+    structure = jax.tree.structure(model_errors[0])
+    return jax.tree.unflatten(structure, [_stacked(alike) for alike in leaves])
 
 
 def _stacked(arrays: Sequence[Any]) -> np.ndarray:
@@ -346,8 +348,8 @@ def log_ratio(error: ModelError, theta: jax.Array, residual: Means, means: Means
     def at(size: jax.Array) -> jax.Array:
         return error.log_ratio(jnp.concatenate([theta, size]), residual, means)
 
-    each = jax.vmap(at)(sizes)
-    return logsumexp(each) - jnp.log(len(sizes))
+    log_ratios = jax.vmap(at)(sizes)
+    return logsumexp(log_ratios) - jnp.log(len(sizes))
 
 
 class Candidate(NamedTuple):

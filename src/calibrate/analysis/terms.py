@@ -99,7 +99,7 @@ class Terms(TableRepr):
 
         Tests that alone show a term do not count; it is empty without others.
         """
-        rows = [(each.points, each.of_sets) for each in self.held_out if not each.alone]
+        rows = [(report.points, report.of_sets) for report in self.held_out if not report.alone]
         if not rows:
             return []
         points, by_test = zip(*rows, strict=True)
@@ -108,10 +108,10 @@ class Terms(TableRepr):
     def held_out_in_words(self) -> str:
         """Return which tests the others do not predict, and which set predicts best."""
         words = []
-        for each in self.held_out:
-            if each.missed:
-                alone = f", which alone shows {', '.join(each.alone)}" if each.alone else ""
-                words.append(f"the others do not predict '{each.test}'{alone}")
+        for report in self.held_out:
+            if report.missed:
+                alone = f", which alone shows {', '.join(report.alone)}" if report.alone else ""
+                words.append(f"the others do not predict '{report.test}'{alone}")
         words = words or ["each test is predicted by the others"]
         if scores := self.log_densities:
             best = int(np.argmax(scores)) if max(scores) > scores[0] + _BETTER else 0
@@ -157,10 +157,10 @@ def find_terms(
     if not y.size or not np.any(y):
         raise InputError("terms: all data are zero, or there are none")
     names = model.forward.scene.parameter_names
-    found = _compared(G, y, names)
+    terms = _compared(G, y, names)
     if not held_out:
-        return found
-    return replace(found, held_out=_held_out(_of_tests(model), white, G, y, found))
+        return terms
+    return replace(terms, held_out=_held_out(_of_tests(model), white, G, y, terms))
 
 
 def _of_tests(model: Model) -> dict[str, np.ndarray]:
@@ -171,7 +171,7 @@ def _of_tests(model: Model) -> dict[str, np.ndarray]:
             for test, rows in part.tests(model.observe.entries.get(name)).items():
                 entries.setdefault(test, []).append(begin + rows)
         begin += int(np.prod(model.observe.shapes[name]))
-    return {test: np.concatenate(each) for test, each in entries.items()}
+    return {test: np.concatenate(rows) for test, rows in entries.items()}
 
 
 def _whitening(model: Model) -> np.ndarray:
@@ -233,15 +233,15 @@ def _held_out(
 
     white : the matrix (n, n) that made the errors of y (n,) independent.
     """
-    tests = {test: own for test, own in tests.items() if np.any(y[own])}
+    tests = {test: rows for test, rows in tests.items() if np.any(y[rows])}
     names, reports = list(terms.probabilities), list[HeldOut]()
-    for test, own in tests.items() if len(tests) > 1 else ():
-        rest = np.setdiff1d(np.arange(len(y)), own)
+    for test, rows in tests.items() if len(tests) > 1 else ():
+        rest = np.setdiff1d(np.arange(len(y)), rows)
         posterior, known = posterior_of_sets(G[rest], y[rest], names), seen_columns(G[rest])
         # Errors correlate within a test, not between two, so its rows are whitened by themselves.
-        to_data = np.linalg.inv(white[np.ix_(own, own)])
+        to_data = np.linalg.inv(white[np.ix_(rows, rows)])
         to_data /= np.linalg.norm(to_data, axis=1)[:, None]  # each point in sds of its noise
-        data, columns = to_data @ y[own], to_data @ G[own]
+        data, columns = to_data @ y[rows], to_data @ G[rows]
         number = {posterior.terms(i): i for i in range(len(posterior.sets))}
         listed = [number[tuple(n for n in S if n in posterior.names)] for S, _ in terms.sets]
         likely = np.flatnonzero(posterior.of_sets > _MINOR * posterior.of_sets.max())
@@ -254,5 +254,5 @@ def _held_out(
         densities = [float(by_set[i][2].mean()) for i in listed]
         alone = tuple(names[k] for k in seen_columns(columns) if k not in known)
         errors = error / size, error / posterior.noise
-        reports.append(HeldOut(test, len(own), *errors, inside, densities, alone))
+        reports.append(HeldOut(test, len(rows), *errors, inside, densities, alone))
     return reports

@@ -103,12 +103,12 @@ class _OnFinerMesh:
 
     def __call__(self, draw: Mapping[str, Any], known: Known = ()) -> MeshPair:
         """Return the data; solves start from ``known`` and from the draw's earlier states."""
-        thetas, own = self.model.states.thetas(draw), list[MeshErrorEstimate]()
+        thetas, estimates = self.model.states.thetas(draw), list[MeshErrorEstimate]()
         for theta in thetas:
-            own.append(self.error(theta, self._start(theta), known=[*known, *own]))
-        fine = flat_data(self.observe, [each.fine for each in own], thetas)
-        coarse = flat_data(self.model.observe, [each.coarse for each in own], thetas)
-        return MeshPair(fine, coarse, own)
+            estimates.append(self.error(theta, self._start(theta), known=[*known, *estimates]))
+        fine = flat_data(self.observe, [e.fine for e in estimates], thetas)
+        coarse = flat_data(self.model.observe, [e.coarse for e in estimates], thetas)
+        return MeshPair(fine, coarse, estimates)
 
     @cached_property
     def _start(self) -> Callable[[jax.Array], jax.Array]:

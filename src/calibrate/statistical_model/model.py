@@ -409,7 +409,7 @@ def model(
         forward=restricted,
         full=forward,
         observe=several,
-        noise=at_sites({name: each for name, (_, each) in expanded.items()}, several),
+        noise=at_sites({name: noise_model for name, (_, noise_model) in expanded.items()}, several),
         noise_names={name: source for name, (source, _) in expanded.items()},
         states=states,
         prior=cut_priors,

@@ -65,7 +65,7 @@ def largest_move(
     """
     rows, answers, surprises = len(answers) + _ROUNDS * count, list(answers), list[float]()
     correction = _fitted(predictive, answers, rows)
-    told, fresh = len(answers), list[FEMAnswer]()
+    known, fresh = len(answers), list[FEMAnswer]()
     for round_ in ("around", "uphill", "pool"):
         if round_ == "around":
             points = Kernels.surrounding(z, rng).sample(rng, count)
@@ -85,7 +85,7 @@ def largest_move(
     pool = Pool.search(predictive, correction, z, (), rng)
     heights = _heights(predictive, answers)
     likely = heights > np.max(heights) - _LIKELY - 0.5 * z.shape[1]
-    if np.any(likely[told:] & (np.array(surprises) > _SURPRISE)):
+    if np.any(likely[known:] & (np.array(surprises) > _SURPRISE)):
         return np.inf
     moves = (pool.corrected - normalised(pool.log_cheap)) @ predictive.columns(pool.z)
     draws = predictive.columns(z)
