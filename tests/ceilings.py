@@ -40,6 +40,14 @@ def nodes[N: ast.AST](kind: type[N]) -> Iterator[tuple[str, N]]:
                 yield file, node
 
 
+def functions_of_modules_and_classes() -> Iterator[tuple[str, ast.FunctionDef]]:
+    """Yield every function that is not nested in another one, with its file."""
+    for file, tree in sources().items():
+        scopes = [tree.body, *(node.body for node in tree.body if isinstance(node, ast.ClassDef))]
+        for body in scopes:
+            yield from ((file, node) for node in body if isinstance(node, ast.FunctionDef))
+
+
 def ambiguous_classes() -> list[str]:
     """Return the class names that are used in more than one file."""
     files = defaultdict(set)
@@ -72,8 +80,9 @@ def tables_of_units() -> list[str]:
 def process_wide_objects() -> list[str]:
     """Return what one process has one of: changing containers and locks of a module, and caches.
 
-    A cache counts where it is called with objects: they are found again by identity or equality,
-    and outlive what they follow from. ``emulator.core.kept`` keeps results with their owner.
+    A cache of a module or class counts where it is called with objects: they are found again by
+    identity or equality, and outlive what they follow from. One of a nested function ends with its
+    call. ``emulator.core.kept`` keeps results with their owner.
     """
     made = re.compile(r"(\w*Lock|dict|list|set|defaultdict|Weak\w+)(\[.*\])?\(\)|\{\}|\[.*\]")
     objects = []
@@ -85,7 +94,7 @@ def process_wide_objects() -> list[str]:
                 changes = not name.strip("_").isupper() or ast.unparse(node.value) in ("{}", "[]")
                 if changes and name != "__all__" and made.fullmatch(ast.unparse(node.value)):
                     objects.append(f"{file}:{name}")
-    for file, node in nodes(ast.FunctionDef):
+    for file, node in functions_of_modules_and_classes():
         cached = [d for d in node.decorator_list if re.match(r"(lru_)?cache\b", ast.unparse(d))]
         simple = {"int", "float", "str", "bool", "tuple[int, ...]", "tuple[str, ...]"}
         types = {ast.unparse(a.annotation) for a in node.args.args if a.annotation}

@@ -1,4 +1,4 @@
-r"""What data would determine before there is any, and what to measure next.
+r"""The expected information of data before there are any, and the choice of the next measurement.
 
 **Information.** With :math:`g(x)` the data without noise as a function of the unknowns
 x, :math:`\log\theta` or :math:`\theta` as the parameter's scale is, and S the covariance of the
@@ -144,7 +144,7 @@ def expected_precision(
     data_sets: int = _DATA_SETS,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Return what ``model``'s observations would determine, before any data; plain JSON.
+    """Return the precision expected of ``model``'s observations before any data, as plain JSON.
 
     Parameters
     ----------
@@ -353,7 +353,7 @@ def log_ratio(error: ModelError, theta: jax.Array, residual: Means, means: Means
 
 
 class Candidate(NamedTuple):
-    """Something that could be measured, and what one would know then.
+    """A possible measurement, with the knowledge expected from it.
 
     bits : expected information gain.
     sd : per unknown, its expected sd relative to the present one.

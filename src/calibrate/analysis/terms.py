@@ -1,4 +1,4 @@
-r"""Which terms of a law a test shows: all sets of terms, compared by their evidence.
+r"""The terms of a law that a test supports: all sets of terms, compared by their evidence.
 
 The evidence is that of :mod:`calibrate.analysis.term_sets`. It says which set is likeliest, not
 that any is right. So each test is left out in turn, and predicted by all sets with the
@@ -36,7 +36,7 @@ _LINEAR = 1e-6  # share of the data by which a linear map may miss the forward m
 
 @dataclass(frozen=True)
 class HeldOut:
-    """How well the other tests predict one test; a point is one number of its data.
+    """The prediction of one test from the others; a point is one number of its data.
 
     test : its name.
     points : the number of its points.
@@ -60,7 +60,7 @@ class HeldOut:
 
     @property
     def missed(self) -> bool:
-        """The others do not predict the test: too few of its points are inside the band."""
+        """Whether the others do not predict the test: too few of its points are inside the band."""
         chance = bdtr(round(self.inside * self.points), self.points, 1.0 - 2.0 * _TAIL)
         return self.inside < _MISSED and bool(chance < _CHANCE)
 
@@ -73,7 +73,7 @@ class HeldOut:
 
 @dataclass(frozen=True, repr=False)
 class Terms(TableRepr):
-    """Which terms data show.
+    """The probabilities of a law's terms given data.
 
     probabilities : the posterior probability of each term, by its modulus.
     sets : the likeliest sets, and the probability of each.
@@ -90,7 +90,7 @@ class Terms(TableRepr):
 
     @property
     def undecided(self) -> tuple[str, ...]:
-        """Terms of which the data cannot tell whether they are there."""
+        """Terms whose presence the data leave open."""
         return tuple(name for name, p in self.probabilities.items() if 0.05 < p < 0.95)
 
     @property
@@ -106,7 +106,7 @@ class Terms(TableRepr):
         return [float(x) for x in np.average(by_test, axis=0, weights=points)]
 
     def held_out_in_words(self) -> str:
-        """Return which tests the others do not predict, and which set predicts best."""
+        """Describe which tests the others do not predict, and which set predicts best."""
         words = []
         for report in self.held_out:
             if report.missed:
@@ -215,7 +215,7 @@ def _design(model: Model) -> np.ndarray:
 
 
 def _compared(G: np.ndarray, y: np.ndarray, names: Sequence[str]) -> Terms:
-    """Return the outcome for the columns ``names`` of G (n, p); terms not seen keep their prior."""
+    """Compare all sets of terms by evidence; terms with a zero column of G keep their prior."""
     posterior = posterior_of_sets(G, y, names)
     best = np.argsort(-posterior.of_sets)[:_LISTED]
     return Terms(
@@ -229,7 +229,7 @@ def _compared(G: np.ndarray, y: np.ndarray, names: Sequence[str]) -> Terms:
 def _held_out(
     tests: Mapping[str, np.ndarray], white: np.ndarray, G: np.ndarray, y: np.ndarray, terms: Terms
 ) -> list[HeldOut]:
-    """Return how the others predict each of ``tests`` whose data are not zero.
+    """Predict each of ``tests`` whose data are not zero from the others.
 
     white : the matrix (n, n) that made the errors of y (n,) independent.
     """

@@ -41,7 +41,7 @@ _Sizes = dict[str, tuple[SpecimenCurves, float]]  # each measurement, and its la
 
 
 class SpecimenDraft(NamedTuple):
-    """Files that were written.
+    """The scene file and the experiment file that were written.
 
     path, scene_path : the experiment file, and the scene file that it names.
     scene : the specimen that the latter describes.
@@ -113,7 +113,7 @@ def draft_specimen(
 def _notes(
     cells: Cells, states: States, of_law: str, largest: _Sizes, slope: float, tube: Tube | None
 ) -> list[str]:
-    """Return a sentence for each thing that was read or guessed; ``of_law`` is that on the law."""
+    """Return one sentence per value that was read or guessed; ``of_law`` is the one on the law."""
     notes = [
         f"{len(states.free) // (tube.size if tube else 1)} states in {_tests(states)}",
         of_law,

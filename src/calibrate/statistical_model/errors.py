@@ -78,7 +78,7 @@ def with_systematic(model: Model, *errors: Systematic) -> Model:
 def with_described_errors(
     model: Model, data: Mapping[str, Any], descriptions: Mapping[str, Mapping[str, Any]]
 ) -> tuple[Model, Mapping[str, jax.Array]]:
-    """Return ``model`` of the values that are not missing, with the described errors, and these.
+    """Return ``model`` of the present values with the described errors, and these values.
 
     data : the data by the observation's name, NaN where missing.
     descriptions : the description of each error as in an experiment file, by the error's name.
@@ -235,7 +235,7 @@ def map_errors(
     draws: Mapping[str, np.ndarray],
     data: Mapping[str, Any],
 ) -> MapErrors:
-    """Return what the map's errors do to a posterior.
+    """Return the sizes of the map's errors, and the moves of posterior means that follow.
 
     A Newton step at a few draws and at points around them tells FEM's answer, where the step's own
     check accepts it. Where it accepts fewer than four at draws, FEM runs make it four, and there
@@ -322,7 +322,7 @@ def in_noise_sd(
 def fit(
     unknowns: np.ndarray, errors: np.ndarray, information: np.ndarray, *, of_mesh: bool = False
 ) -> Term:
-    """Return the error that FEM runs show.
+    """Fit the forward map's error to FEM runs.
 
     unknowns : the unknowns at which FEM was run, (n, q).
     errors : FEM's data less the map's, all observations raveled, (n, d).

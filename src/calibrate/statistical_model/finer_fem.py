@@ -1,4 +1,4 @@
-"""FEM that is closer to what was measured: on a finer mesh, or of a specimen between its grips."""
+"""FEM of higher fidelity than a model's: on a finer mesh, or of a specimen between its grips."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class MeshPair(NamedTuple):
 
 
 class FinerFEM(Protocol):
-    """FEM that is closer to what was measured than a model's own."""
+    """FEM of higher fidelity than a model's simulator."""
 
     @property
     def nodes(self) -> int:
@@ -64,7 +64,7 @@ class FinerFEM(Protocol):
 
 
 def finer_fem(model: Model, simulator: EquilibriumSolver) -> FinerFEM:
-    """Return the FEM that is closer to what was measured.
+    """Return the FEM of higher fidelity than the model's simulator.
 
     Raises
     ------

@@ -291,7 +291,7 @@ class Model:
     def given(
         self, data: np.ndarray | Mapping[str, np.ndarray]
     ) -> tuple[Model, dict[str, jax.Array]]:
-        """Return the model of the values that are not missing (NaN), and these, checked.
+        """Return the model of the values that are not missing (NaN), and these values after checks.
 
         :class:`InputError` as :meth:`check_data`, or where every value of an observation is
         missing.

@@ -1,4 +1,4 @@
-r"""By how much FEM in place of the forward map would move posterior means, from few answers of FEM.
+r"""Moves of posterior means by FEM in place of the forward map, estimated from a few FEM solves.
 
 A map that is right where its posterior has draws may be wrong where it has none, and its posterior
 then lacks a part. So FEM is asked at draws, around them, a Gauss-Newton step up its own posterior
@@ -108,7 +108,7 @@ def _heights(predictive: Predictive, answers: list[FEMAnswer]) -> np.ndarray:
 
 
 def _fitted(predictive: Predictive, answers: list[FEMAnswer], rows: int) -> Correction:
-    """Return the correction that the answers teach, of the shape of one of ``rows`` points."""
+    """Fit a correction to FEM's answers, with arrays of the shapes for ``rows`` points."""
     features = predictive.features(np.array([answer.z for answer in answers]))
     errors = np.array([answer.error for answer in answers])
     heights = _heights(predictive, answers)

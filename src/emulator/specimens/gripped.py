@@ -1,4 +1,4 @@
-r"""Stresses of specimens as they were gripped: FEM of the piece, and what is learned from it.
+r"""Stresses of gripped specimens: FEM of the piece, and polynomials of theta fitted to it.
 
 Each test is followed state by state. Where stretches were measured between marks, the grips'
 displacements q are unknown, and Newton's method finds those at which the marks' gradient M is the
@@ -53,14 +53,14 @@ _FEWEST = 10  # theta
 
 
 def added(P: jax.Array, shares: jax.Array) -> jax.Array:
-    """Return stresses (m, 3, 3) with what grips add, ``shares`` (m, 3, 3) of each one's norm."""
+    """Return stresses P (m, 3, 3) plus ``shares`` (m, 3, 3) of their norms, which grips add."""
     square = jnp.sum(P**2, axis=(1, 2), keepdims=True)
     loaded = square > 0.0  # at rest the root has no derivative
     return P + jnp.where(loaded, jnp.sqrt(jnp.where(loaded, square, 1.0)), 0.0) * shares
 
 
 def gripped_stresses(scene: Specimen, P: jax.Array, theta: jax.Array) -> jax.Array:
-    """Return homogeneous stresses (m, 3, 3) with what the scene's grips add, if it was learned."""
+    """Return homogeneous stresses (m, 3, 3) plus those of the scene's grips, if learned."""
     if scene.grips is None or (learned := scene.grips.learned) is None:
         return P
     if learned.of != of_grips(scene):
@@ -146,7 +146,7 @@ class GrippedSpecimen:
         return P
 
     def shares(self, theta: jax.Array) -> np.ndarray:
-        """Return what grips add to each state, (m, 3, 3), as shares of its homogeneous stress.
+        """Return the stress that grips add to each state, (m, 3, 3), over its homogeneous norm.
 
         At most six states of a test are solved; those between them are interpolated.
 
@@ -232,7 +232,7 @@ def _spread(rows: np.ndarray, sizes: np.ndarray) -> np.ndarray:
 def learn_grips(
     specimen: Specimen, runs: int = RUNS, *, seed: int = 0, progress: bool = False
 ) -> GripStresses:
-    """Return what grips add to a specimen's stresses, from FEM at ``runs`` theta of its box.
+    """Learn the stresses that grips add to a specimen's, from FEM at ``runs`` theta of its box.
 
     Theta at which FEM fails are left out.
 

@@ -1,4 +1,4 @@
-r"""Specimens as they were held: a box of tissue between the grips of a testing machine.
+r"""Gripped specimens: a box of tissue between the grips of a testing machine.
 
 A homogeneous state (:mod:`emulator.specimens.specimen`) is what the middle of a piece would do far
 from its grips. The piece itself is a box, whose faces the machine moves by grip displacements q,

@@ -115,12 +115,12 @@ class Specimen(ForwardProblem):
 
     @property
     def node_count(self) -> int:
-        """Three for each state: the corners of its unit cube."""
+        """The number of corners of the unit cubes, three for each state."""
         return 3 * len(self.states.free)
 
     @property
     def mesh(self) -> Mesh:
-        """There is none: :class:`InputError` for what needs one, such as a place or a picture."""
+        """Raise :class:`InputError`: a specimen has no mesh, which places and pictures need."""
         return with_mesh(self).mesh
 
     def gradients(self, u: jax.Array) -> jax.Array:
@@ -225,7 +225,7 @@ def read_states(table: Path | Cells, tube: Tube | None = None) -> States:
 
 
 def _likely(words: Sequence[str]) -> str:
-    """Return which names the columns of other conventions may have to get, in words."""
+    """Suggest names for columns that follow other conventions."""
     renamed = []
     for word in words:
         name, unit = with_unit(word)

@@ -1,4 +1,4 @@
-r"""Discrepancy models: Gaussian processes of the principal modes of what a map leaves of FEM.
+r"""Discrepancy models: Gaussian processes of the principal modes of a map's errors against FEM.
 
 .. math:: u(\theta) \approx m(\theta) + \bar e + \sum_k c_k(x)\, \phi_k
 
@@ -109,7 +109,7 @@ class Discrepancy(ArrayPart):
 def fit_discrepancy(
     scene: Scene, runs: Runs, expansion: Expansion, mean_map: Mean | None = None
 ) -> Discrepancy:
-    """Fit a discrepancy model to what ``mean_map`` leaves of FEM ``runs``.
+    """Fit a discrepancy model to the differences of FEM ``runs`` from ``mean_map``.
 
     Parameters
     ----------
