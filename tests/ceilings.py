@@ -14,8 +14,11 @@ from functools import cache, partial
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-WORDS = {"own": 22, "found": 19, "given": 13, "told": 1, "moved": 6, "each": 51}
-"""Words that name nothing, each with the number of names that are called so at most."""
+WORDS = {"own": 0, "found": 0, "given": 2, "told": 0, "moved": 0, "each": 0}
+"""Words that name nothing, each with the number of names that are called so at most.
+
+The two of ``given`` are public: ``Model.given`` and the argument of ``specimen``.
+"""
 
 LONGEST = 60  # lines of a function, with its docstring
 _SOLVES = {"solve", "inv", "lstsq", "cholesky", "cho_solve", "cho_factor", "solve_triangular"}
@@ -173,17 +176,17 @@ def lines_of_spine() -> list[str]:
 
 
 FIGURES: dict[str, tuple[int, Callable[[], list[str]]]] = {
-    "class names with two meanings": (5, ambiguous_classes),
-    "files with a table of units": (5, tables_of_units),
-    "objects and caches of the process": (3, process_wide_objects),
+    "class names with two meanings": (0, ambiguous_classes),
+    "files with a table of units": (1, tables_of_units),
+    "objects and caches of the process": (2, process_wide_objects),
     "files that weight points": (5, weighted_points),
     "files that solve dense systems": (19, dense_solves),
-    "members of Observation": (33, observation_members),
+    "members of Observation": (11, observation_members),
     "public names": (144, public_names),
     "deep imports of studies": (566, deep_imports_of_studies),
     "files of the spine": (43, spine),
-    "lines of the spine": (10_843, lines_of_spine),
-    f"functions above {LONGEST} lines": (20, long_functions),
+    "lines of the spine": (10_702, lines_of_spine),
+    f"functions above {LONGEST} lines": (17, long_functions),
     **{f"names '{w}'": (most, partial(names_called, w)) for w, most in WORDS.items()},
 }
 """Each figure's ceiling, and what it counts."""
