@@ -64,7 +64,9 @@ def volume_at(theta):
 
 
 value_and_gradient = jax.jit(jax.value_and_grad(volume_at))
-print(f"volume and gradient, every theta:  {1e3 * seconds(value_and_gradient, scene.centre):8.3f} ms")
+print(
+    f"volume and gradient, every theta:  {1e3 * seconds(value_and_gradient, scene.centre):8.3f} ms"
+)
 
 # %% [markdown]
 # ## Data
@@ -162,9 +164,7 @@ assert total["pressure"] + total["a_f"] > 0.8
 rows = np.random.default_rng(0).integers(500, size=3)
 for row in rows:
     one = {name: float(draws[name][0, row]) for name in draws}
-    theta = scene.theta(
-        a=one["a"], b=2.2, a_f=one["a_f/a"] * one["a"], b_f=2.4, pressure=1.0
-    )
+    theta = scene.theta(a=one["a"], b=2.2, a_f=one["a_f/a"] * one["a"], b_f=2.4, pressure=1.0)
     by_fem = float(volume.evaluate(simulator(theta)[volume.nodes], theta))
     by_network = float(volume_at(theta))
     print(f"FEM {by_fem:8.3f} mL   network {by_network:8.3f} mL")

@@ -347,9 +347,9 @@ def load(name: str | Path, scene: Scene | None = None, *, kind: str | None = Non
     except (KeyError, TypeError) as error:
         raise InputError(f"{file} lacks or garbles {error}") from error
     parts: dict[str, Any] = {}
-    for part, kind in kinds.items():
+    for part, part_kind in kinds.items():
         try:
-            parts[part] = kind.restore(scene, description["parts"][part], inside(arrays, part))
+            parts[part] = part_kind.restore(scene, description["parts"][part], inside(arrays, part))
         except (KeyError, TypeError) as error:
             raise InputError(f"{folder}: its part '{part}' lacks or garbles {error}") from error
         except InputError as error:
