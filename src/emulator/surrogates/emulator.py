@@ -290,16 +290,6 @@ KINDS = ("series", "physics")
 beside it, and polynomials that no simulation taught."""
 
 
-def shipped_name(name: str, kind: str | None) -> str:
-    """Return the name of the shipped emulator of ``kind`` for the scene called ``name``.
-
-    Without a kind it is the graph network's, which has the scene's name.
-    """
-    if kind is not None:
-        check_known(kind, KINDS, "kind")
-    return name if kind is None else f"{name}_{kind}"
-
-
 def load(name: str | Path, scene: Scene | None = None, *, kind: str | None = None) -> Emulator:
     """Return the emulator in folder ``name``, or the shipped one of that name.
 
@@ -317,8 +307,10 @@ def load(name: str | Path, scene: Scene | None = None, *, kind: str | None = Non
     InputError
         Missing or damaged files, or a scene that is not the one it was trained for.
     """
-    name = shipped_name(str(name), kind)
-    folder = SHIPPED / name if name in shipped() else Path(name)
+    if kind is not None:
+        check_known(kind, KINDS, "kind")
+        name = f"{name}_{kind}"
+    folder = SHIPPED / str(name) if str(name) in shipped() else Path(name)
     if not (folder / "emulator.json").is_file():
         raise InputError(
             f"emulator '{name}' is neither shipped nor a folder with emulator.json; "
@@ -361,10 +353,9 @@ def load(name: str | Path, scene: Scene | None = None, *, kind: str | None = Non
 
 def _build(ingredients: Ingredients, _: Options) -> ForwardMap:
     scene = with_mesh(ingredients.scene)
-    name = ingredients.emulator
-    if name is None or name in KINDS:
-        name = shipped_name(scene.name, name)
-    return load(name, scene).cache()
+    kind = ingredients.emulator if ingredients.emulator in KINDS else None
+    name = ingredients.emulator if kind is None else None
+    return load(name or scene.name, scene, kind=kind).cache()
 
 
 EMULATOR = ForwardKind(
