@@ -100,7 +100,7 @@ axes.set(xlim=(50, 100), ylim=(50, 100), xlabel="mu (kPa)", ylabel="lam (kPa)")
 # %% [markdown]
 # ## What does FEM say?
 #
-# Draws are pushed through FEM and reweighted by the ratio of likelihoods. If the weights have a light tail and the means do not move, the emulator's posterior is FEM's.
+# FEM runs at draws of the posterior, around them and at draws of the prior train a correction of the map, and a pool of cheap points follows the corrected map's posterior. Further FEM runs at points of this pool, weighted by the ratio of likelihoods, test it. If the weights have a light tail and the means do not move, the emulator's posterior is FEM's.
 
 # %%
 certificate = cal.certify(posterior, simulator)

@@ -187,12 +187,12 @@ def specimen() -> Journey:
 
 
 JOURNEYS: dict[str, tuple[int, Callable[[], Journey]]] = {
-    "scene TOML to Scene": (16, scene_file),
-    "Simulator.solve to law.energy": (11, solve),
-    "calibrate infer to the data file": (29, parse),
-    "calibrate infer to the likelihood": (73, likelihood),
-    "table of a specimen to the likelihood": (76, specimen),
-    "calibrate certify to Simulator.solve": (66, check),
+    "scene TOML to Scene": (17, scene_file),
+    "Simulator.solve to law.energy": (12, solve),
+    "calibrate infer to the data file": (32, parse),
+    "calibrate infer to the likelihood": (80, likelihood),
+    "table of a specimen to the likelihood": (78, specimen),
+    "calibrate certify to Simulator.solve": (70, check),
 }
 """Journeys by what they lead from and to, each with the most files that it may enter."""
 

@@ -58,7 +58,7 @@ class Body:
 
 def of_scene(name: str) -> dict[str, str]:
     """The emulator that is shipped of a scene, and its network."""
-    return {"emulator as shipped": name, "network alone": f"{name}_pignn"}
+    return {"emulator as shipped": f"{name}_series", "network alone": name}
 
 
 def linear(scene: Callable[..., Scene], *sizes: Any) -> Callable[[], Scene]:

@@ -165,7 +165,7 @@ def posterior_of(model, data, draws, chains=4, diverging=0):
 
 # ---- problems ----------------------------------------------------------------------------------
 def beam():
-    emulator = em.load("once_clamped_beam").cache()
+    emulator = em.load("once_clamped_beam", kind="series").cache()
     observe = spread_nodes(emulator.scene, 20, 0)
     forward = Map(emulator.scene, Restricted(emulator), all_nodes(emulator.scene))
     truth = np.array([73.0, 61.0])

@@ -54,7 +54,7 @@ def step_s(device: jax.Device, batch: int, steps: int) -> float:
     """Seconds of a step of the paper's training, ``batch`` theta each, prepared on the CPU."""
     plan = Paper(steps=steps, batch=batch)
     with jax.default_device(jax.devices("cpu")[0]):
-        training = plan.prepare(Job(em.load("left_ventricle").scene)).training
+        training = plan.prepare(Job(em.load("left_ventricle", kind="series").scene)).training
         state = training.initial()
     state = jax.device_put(state, device)
     for _ in range(3):

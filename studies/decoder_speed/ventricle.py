@@ -125,7 +125,7 @@ def _both(function: Function, scene: em.Scene, calls: int) -> tuple[float, float
 
 def study(calls: int, fem_calls: int, runs: int, batch: int, seed: int) -> list[dict]:
     """Times of every method's value and gradient, measured in one run."""
-    trained = em.load(SCENE)
+    trained = em.load(SCENE, kind="series")
     scene, whole = trained.scene, trained.cache()
     misfit = Misfit(whole, seed)
     simulator = em.Simulator(scene)

@@ -10,7 +10,7 @@ ESTIMATES = ("error bar", "one step", "two steps", "centre tangent")
 def named(case: Case) -> str:
     """Scene and map in short: the scene's own emulator is ``shipped``, its network ``network``."""
     scene, map_ = case["scene"], case["map"].removeprefix("shipped ").strip("'")
-    own = {scene: "shipped", f"{scene}_pignn": "network alone", "ventricle_family": "family"}
+    own = {f"{scene}_series": "series", scene: "network", "ventricle_family": "family"}
     return f"{SHORT.get(scene, scene)}, {own.get(map_, map_)}"
 
 

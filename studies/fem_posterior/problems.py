@@ -88,13 +88,13 @@ def _problem(name: str, scene: Scene, forward: ForwardMap, words: dict[str, Any]
 def _beam() -> Problem:
     words = {"truth": {"mu": 72.0, "lam": 68.0}, "observe": "nodes:20", "noise": 0.2}
     scene = em.find_scene("once_clamped_beam")
-    return _problem("beam", scene, em.load("once_clamped_beam").cache(), words)
+    return _problem("beam", scene, em.load("once_clamped_beam", kind="series").cache(), words)
 
 
 def _cube() -> Problem:
     words = {"truth": {"E": 9.0, "nu": 0.28}, "observe": "landmarks:20", "noise": 0.05}
     scene = em.find_scene("twisting_cube")
-    return _problem("cube", scene, em.load("twisting_cube").cache(), words)
+    return _problem("cube", scene, em.load("twisting_cube", kind="series").cache(), words)
 
 
 def _coarse() -> Problem:
@@ -106,7 +106,7 @@ def _coarse() -> Problem:
 
 def _ventricle() -> Problem:
     scene = em.find_scene("left_ventricle")
-    return _problem("ventricle", scene, em.load("left_ventricle").cache(), VENTRICLE)
+    return _problem("ventricle", scene, em.load("left_ventricle", kind="series").cache(), VENTRICLE)
 
 
 PROBLEMS: dict[str, Callable[[], Problem]] = {

@@ -3,7 +3,7 @@
     python -m studies.networks_alone
     python -m studies.networks_alone --quick --out DIR    # a coarse beam, few steps
 
-The shipped ``<scene>_pignn``, which sweeps have taught, are judged by FEM at theta that none has
+The shipped networks, which sweeps have taught, are judged by FEM at theta that none has
 seen. Then the beam's is trained again, on FEM runs, with one idea left out or exchanged at a time:
 equally many steps, runs and test theta, three seeds. Writes results.json, after each training, and
 networks.png beside itself or under --out; trainings that results.json holds already are not
@@ -154,7 +154,7 @@ def known_of(scene: Scene, tests: int) -> Runs:
 
 def alone(name: str, tests: int) -> dict[str, Any]:
     """How accurate the shipped network of scene ``name`` is, and the emulator shipped beside it."""
-    network, beside = load(f"{name}_pignn"), load(name)
+    network, beside = load(name), load(name, kind="series")
     record = network.record
     return {
         "name": name,
@@ -182,7 +182,7 @@ def study(arguments: argparse.Namespace) -> list[dict[str, Any]]:
 
     done = {case["name"] for case in cases}
     for name in SCENES[:1] if arguments.quick else SCENES:
-        if name not in done and f"{name}_pignn" in shipped():
+        if name not in done and name in shipped():
             add(alone(name, arguments.tests))
     scene = em.scenes.once_clamped_beam(*([(4, 2, 2)] if arguments.quick else []), order=1)
     known = known_of(scene, arguments.tests)

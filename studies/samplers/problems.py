@@ -37,7 +37,7 @@ class Problem:
     def forward(self) -> ForwardMap:
         """Return the scene's map."""
         if self.shipped:
-            return em.load(self.scene).cache()
+            return em.load(self.scene, kind="series").cache()
         scene = em.find_scene(self.scene)
         return Emulator(scene, taylor=expand(em.Simulator(scene), order=2)).cache()
 

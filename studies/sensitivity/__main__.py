@@ -95,7 +95,7 @@ def normal_prior(scene: em.Scene) -> dict[str, Any]:
 
 def ventricle(results: Results, sizes: dict[str, int]) -> xr.DataTree:
     """All cases of the ventricle; the nodewise indices."""
-    trained = em.load(SCENE)
+    trained = em.load(SCENE, kind="series")
     scene, cached = trained.scene, trained.cache()
     observe = observed(scene)
     fem = fem_forward(em.Simulator(scene), start=cached)
@@ -220,7 +220,7 @@ def main() -> None:
         case = results.case("segments, FEM", lambda: segments(sizes["segments"]))
         draw_segments(case, arguments.out / "segments.png")
     draw_indices(cases, arguments.out / "indices.png")
-    save(body_figure(field, em.load(SCENE).scene), arguments.out / "body.png")
+    save(body_figure(field, em.load(SCENE, kind="series").scene), arguments.out / "body.png")
     check(cases)
 
 

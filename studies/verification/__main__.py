@@ -144,7 +144,7 @@ MADE: dict[str, Callable[[Path], em.Emulator]] = {
 def emulator_of(body: str) -> em.Emulator:
     """The emulator called ``body``: shipped, or trained."""
     if body not in MADE:
-        return em.load(body)
+        return em.load(body, kind="series")
     with tempfile.TemporaryDirectory() as folder:
         return MADE[body](Path(folder))
 

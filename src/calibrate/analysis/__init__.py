@@ -1,1 +1,1 @@
-"""Questions asked of a model or posterior: what data can tell, what its numbers depend on."""
+"""Analyses of a model or posterior: the information in data, the sensitivity of predictions."""

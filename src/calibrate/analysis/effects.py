@@ -1,4 +1,4 @@
-"""Effects that a scene can do without: the change of the observations, and the time, of each.
+"""Effects that may be left out of a scene, with their change of the observations and their time.
 
 Everything is measured by FEM, the whole scene's runs against the simpler scene's at the same theta.
 Effects that alone change every observation by no more than its tolerance, and whose absence saves

@@ -1,4 +1,4 @@
-r"""What data would determine before there is any, and what to measure next.
+r"""The expected information of data before there are any, and the choice of the next measurement.
 
 **Information.** With :math:`g(x)` the data without noise as a function of the unknowns
 x, :math:`\log\theta` or :math:`\theta` as the parameter's scale is, and S the covariance of the
@@ -144,7 +144,7 @@ def expected_precision(
     data_sets: int = _DATA_SETS,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Return what ``model``'s observations would determine, before any data; plain JSON.
+    """Return the precision expected of ``model``'s observations before any data, as plain JSON.
 
     Parameters
     ----------
@@ -316,9 +316,11 @@ def of_each(errors: Errors, means: Mapping[str, jax.Array]) -> ModelError:
     """Return the errors of all data sets, stacked along a leading axis; means (r, ...) by name."""
     arrays = {name: np.asarray(values) for name, values in means.items()}
     count = len(next(iter(arrays.values())))
-    each = [errors({name: values[k] for name, values in arrays.items()}) for k in range(count)]
-    leaves = zip(*(jax.tree.leaves(error) for error in each), strict=True)
-    return jax.tree.unflatten(jax.tree.structure(each[0]), [_stacked(alike) for alike in leaves])
+    data_sets = ({name: values[k] for name, values in arrays.items()} for k in range(count))
+    model_errors = [errors(data) for data in data_sets]
+    leaves = zip(*map(jax.tree.leaves, model_errors), strict=True)
+    structure = jax.tree.structure(model_errors[0])
+    return jax.tree.unflatten(structure, [_stacked(alike) for alike in leaves])
 
 
 def _stacked(arrays: Sequence[Any]) -> np.ndarray:
@@ -346,12 +348,12 @@ def log_ratio(error: ModelError, theta: jax.Array, residual: Means, means: Means
     def at(size: jax.Array) -> jax.Array:
         return error.log_ratio(jnp.concatenate([theta, size]), residual, means)
 
-    each = jax.vmap(at)(sizes)
-    return logsumexp(each) - jnp.log(len(sizes))
+    log_ratios = jax.vmap(at)(sizes)
+    return logsumexp(log_ratios) - jnp.log(len(sizes))
 
 
 class Candidate(NamedTuple):
-    """Something that could be measured, and what one would know then.
+    """A possible measurement, with the knowledge expected from it.
 
     bits : expected information gain.
     sd : per unknown, its expected sd relative to the present one.

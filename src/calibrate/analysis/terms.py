@@ -1,4 +1,4 @@
-r"""Which terms of a law a test shows: all sets of terms, compared by their evidence.
+r"""The terms of a law that a test supports: all sets of terms, compared by their evidence.
 
 The evidence is that of :mod:`calibrate.analysis.term_sets`. It says which set is likeliest, not
 that any is right. So each test is left out in turn, and predicted by all sets with the
@@ -36,7 +36,7 @@ _LINEAR = 1e-6  # share of the data by which a linear map may miss the forward m
 
 @dataclass(frozen=True)
 class HeldOut:
-    """How well the other tests predict one test; a point is one number of its data.
+    """The prediction of one test from the others; a point is one number of its data.
 
     test : its name.
     points : the number of its points.
@@ -60,7 +60,7 @@ class HeldOut:
 
     @property
     def missed(self) -> bool:
-        """The others do not predict the test: too few of its points are inside the band."""
+        """Whether the others do not predict the test: too few of its points are inside the band."""
         chance = bdtr(round(self.inside * self.points), self.points, 1.0 - 2.0 * _TAIL)
         return self.inside < _MISSED and bool(chance < _CHANCE)
 
@@ -73,7 +73,7 @@ class HeldOut:
 
 @dataclass(frozen=True, repr=False)
 class Terms(TableRepr):
-    """Which terms data show.
+    """The probabilities of a law's terms given data.
 
     probabilities : the posterior probability of each term, by its modulus.
     sets : the likeliest sets, and the probability of each.
@@ -90,7 +90,7 @@ class Terms(TableRepr):
 
     @property
     def undecided(self) -> tuple[str, ...]:
-        """Terms of which the data cannot tell whether they are there."""
+        """Terms whose presence the data leave open."""
         return tuple(name for name, p in self.probabilities.items() if 0.05 < p < 0.95)
 
     @property
@@ -99,19 +99,19 @@ class Terms(TableRepr):
 
         Tests that alone show a term do not count; it is empty without others.
         """
-        rows = [(each.points, each.of_sets) for each in self.held_out if not each.alone]
+        rows = [(report.points, report.of_sets) for report in self.held_out if not report.alone]
         if not rows:
             return []
         points, by_test = zip(*rows, strict=True)
         return [float(x) for x in np.average(by_test, axis=0, weights=points)]
 
     def held_out_in_words(self) -> str:
-        """Return which tests the others do not predict, and which set predicts best."""
+        """Describe which tests the others do not predict, and which set predicts best."""
         words = []
-        for each in self.held_out:
-            if each.missed:
-                alone = f", which alone shows {', '.join(each.alone)}" if each.alone else ""
-                words.append(f"the others do not predict '{each.test}'{alone}")
+        for report in self.held_out:
+            if report.missed:
+                alone = f", which alone shows {', '.join(report.alone)}" if report.alone else ""
+                words.append(f"the others do not predict '{report.test}'{alone}")
         words = words or ["each test is predicted by the others"]
         if scores := self.log_densities:
             best = int(np.argmax(scores)) if max(scores) > scores[0] + _BETTER else 0
@@ -157,10 +157,10 @@ def find_terms(
     if not y.size or not np.any(y):
         raise InputError("terms: all data are zero, or there are none")
     names = model.forward.scene.parameter_names
-    found = _compared(G, y, names)
+    terms = _compared(G, y, names)
     if not held_out:
-        return found
-    return replace(found, held_out=_held_out(_of_tests(model), white, G, y, found))
+        return terms
+    return replace(terms, held_out=_held_out(_of_tests(model), white, G, y, terms))
 
 
 def _of_tests(model: Model) -> dict[str, np.ndarray]:
@@ -171,7 +171,7 @@ def _of_tests(model: Model) -> dict[str, np.ndarray]:
             for test, rows in part.tests(model.observe.entries.get(name)).items():
                 entries.setdefault(test, []).append(begin + rows)
         begin += int(np.prod(model.observe.shapes[name]))
-    return {test: np.concatenate(each) for test, each in entries.items()}
+    return {test: np.concatenate(rows) for test, rows in entries.items()}
 
 
 def _whitening(model: Model) -> np.ndarray:
@@ -215,7 +215,7 @@ def _design(model: Model) -> np.ndarray:
 
 
 def _compared(G: np.ndarray, y: np.ndarray, names: Sequence[str]) -> Terms:
-    """Return the outcome for the columns ``names`` of G (n, p); terms not seen keep their prior."""
+    """Compare all sets of terms by evidence; terms with a zero column of G keep their prior."""
     posterior = posterior_of_sets(G, y, names)
     best = np.argsort(-posterior.of_sets)[:_LISTED]
     return Terms(
@@ -229,19 +229,19 @@ def _compared(G: np.ndarray, y: np.ndarray, names: Sequence[str]) -> Terms:
 def _held_out(
     tests: Mapping[str, np.ndarray], white: np.ndarray, G: np.ndarray, y: np.ndarray, terms: Terms
 ) -> list[HeldOut]:
-    """Return how the others predict each of ``tests`` whose data are not zero.
+    """Predict each of ``tests`` whose data are not zero from the others.
 
     white : the matrix (n, n) that made the errors of y (n,) independent.
     """
-    tests = {test: own for test, own in tests.items() if np.any(y[own])}
+    tests = {test: rows for test, rows in tests.items() if np.any(y[rows])}
     names, reports = list(terms.probabilities), list[HeldOut]()
-    for test, own in tests.items() if len(tests) > 1 else ():
-        rest = np.setdiff1d(np.arange(len(y)), own)
+    for test, rows in tests.items() if len(tests) > 1 else ():
+        rest = np.setdiff1d(np.arange(len(y)), rows)
         posterior, known = posterior_of_sets(G[rest], y[rest], names), seen_columns(G[rest])
         # Errors correlate within a test, not between two, so its rows are whitened by themselves.
-        to_data = np.linalg.inv(white[np.ix_(own, own)])
+        to_data = np.linalg.inv(white[np.ix_(rows, rows)])
         to_data /= np.linalg.norm(to_data, axis=1)[:, None]  # each point in sds of its noise
-        data, columns = to_data @ y[own], to_data @ G[own]
+        data, columns = to_data @ y[rows], to_data @ G[rows]
         number = {posterior.terms(i): i for i in range(len(posterior.sets))}
         listed = [number[tuple(n for n in S if n in posterior.names)] for S, _ in terms.sets]
         likely = np.flatnonzero(posterior.of_sets > _MINOR * posterior.of_sets.max())
@@ -254,5 +254,5 @@ def _held_out(
         densities = [float(by_set[i][2].mean()) for i in listed]
         alone = tuple(names[k] for k in seen_columns(columns) if k not in known)
         errors = error / size, error / posterior.noise
-        reports.append(HeldOut(test, len(own), *errors, inside, densities, alone))
+        reports.append(HeldOut(test, len(rows), *errors, inside, densities, alone))
     return reports

@@ -1,8 +1,11 @@
 """The evidence of a certificate: figures with their errors, and the limit of each.
 
-Every figure has a Monte Carlo error. A figure is within its limit if it is below by more than twice
-that error, beyond its limit if it is above by more than twice that error, and undecided in between.
-So more FEM runs may decide what few leave open, but do not turn one verdict into the other.
+Every figure has a Monte Carlo error. A figure is within its limit if it is below by more than 2.4
+times that error, beyond its limit if it is above by more than that, and undecided in between. A
+check adds FEM runs only while its verdict is undecided. A check that begins with more runs may also
+refuse what one with fewer accepted, or accept what it refused: a figure near its limit is misjudged
+with the small probability given at ``_ERRORS``, and FEM may fail, or find the data likely, where
+fewer runs did not look.
 """
 
 from __future__ import annotations

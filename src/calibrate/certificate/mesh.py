@@ -147,12 +147,12 @@ def _differences_of_fem(predictive: Predictive, finer: FinerFEM, bar: tqdm) -> D
 
     def differences(z: np.ndarray) -> Iterator[np.ndarray | None]:
         draws, later = predictive.constrain(z), list[MeshErrorEstimate]()
-        each = ({name: values[k] for name, values in draws.items()} for k in range(len(z)))
-        for number, found in enumerate(in_order(difference, each, finer.workers)):
-            if found is not None:  # the first point is solved alone
-                (later if number else known).extend(found.estimates)
+        points = ({name: values[k] for name, values in draws.items()} for k in range(len(z)))
+        for number, pair in enumerate(in_order(difference, points, finer.workers)):
+            if pair is not None:  # the first point is solved alone
+                (later if number else known).extend(pair.estimates)
             bar.update(len(predictive.model.states.states))
-            yield None if found is None else found.fine - found.coarse
+            yield None if pair is None else pair.fine - pair.coarse
         known.extend(later)
 
     return differences

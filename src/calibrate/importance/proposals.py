@@ -159,8 +159,8 @@ class Kernels:
         scale = width * np.sqrt(self.freedom / rng.chisquare(self.freedom, size=(count, 1)))
         z = scale * rng.normal(size=(count, self.groups[0].centres.shape[1]))
         for group, begin, end in zip(self.groups, [0, *ends], ends, strict=False):
-            own = (rows >= begin) & (rows < end)
-            z[own] = group.at((rows[own] - begin) % len(group.centres), z[own])
+            members = (rows >= begin) & (rows < end)
+            z[members] = group.at((rows[members] - begin) % len(group.centres), z[members])
         return z
 
     def log_density(self, z: np.ndarray) -> np.ndarray:

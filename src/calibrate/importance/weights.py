@@ -1,4 +1,4 @@
-"""Importance weights of points: what they are worth, and the tail of their distribution."""
+"""Importance weights of points: their effective number, and the tail of their distribution."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Observations: what of a displacement field was measured, files of its data, and their units.
+"""Observations of displacement fields, the files of their data, and their units.
 
 A kind of observation is a subclass of :class:`Observation`; the kinds are listed in
 :data:`OBSERVATIONS`. :class:`Observations` holds several of one body by name.
@@ -109,7 +109,7 @@ __all__ = [
 def parse_observation(
     scene: ForwardProblem, text: str, seed: int = 0, states: Sequence[str] = ("",)
 ) -> Observations:
-    """Return what the words joined by ``+`` ask for, e.g. ``landmarks:24+volume``.
+    """Return the observations that words joined by ``+`` name, e.g. ``landmarks:24+volume``.
 
     A word is asked for in each of ``states``; ``volume@diastole`` in that load state only.
 
@@ -144,7 +144,7 @@ def _parse_word(scene: ForwardProblem, word: str, seed: int) -> tuple[str, Obser
 def observations_from_json(
     scene: ForwardProblem, description: Mapping[str, Mapping[str, Any]]
 ) -> Observations:
-    """Return what :meth:`Observations.to_json` described."""
+    """Return the observations that :meth:`Observations.to_json` described."""
 
     @cache
     def made(text: str) -> Observation:

@@ -262,7 +262,7 @@ class Observations:
         return {name: data[name] for name in self.parts}, valid
 
     def expand[T](self, values: Mapping[str, T], what: str) -> dict[str, tuple[str, T]]:
-        """Return values by the parts' names, from values by name, with or without its load state.
+        """Return values by the parts' names, from values by names with or without a load state.
 
         ``{"volume": v}`` gives ``v`` to the volume of every load state. Each value comes with the
         name it was given under; a part that ``values`` does not mention has none.
@@ -301,7 +301,7 @@ class Observations:
 
 
 class Decoding(NamedTuple):
-    """A matrix that linear observations make of the displacements of all nodes, and what is left.
+    """The matrix from displacements to the data of linear observations, and the other observations.
 
     matrix : its product (r,) with the displacements (3 k,) has the data of linear observations, and
         after it the displacements of the nodes of the others.

@@ -1,4 +1,4 @@
-r"""Surfaces of an image's frames as data: how far each is from the body at rest, along its normals.
+r"""Surfaces of image frames as data: their distances from the body at rest along its normals.
 
 At points X of a facet set with normal n, the surface of a frame is met by the line along the
 normal at
@@ -115,7 +115,7 @@ def _outward(mesh: Mesh, facet_set: str) -> float:
 def along_normals(
     points: np.ndarray, normals: np.ndarray, surface: Surface, reach: float, outward: float = 0.0
 ) -> np.ndarray:
-    """Return the way (d,) in mm from ``points`` along unit ``normals`` (d, 3) to a surface.
+    """Return signed distances (d,) in mm from ``points`` to a surface, along ``normals`` (d, 3).
 
     NaN where the line does not meet it within ``reach`` mm to either side.
 

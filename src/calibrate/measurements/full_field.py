@@ -277,7 +277,7 @@ def field_data(
 
 
 def _check_order(field: FullField, amounts: np.ndarray) -> None:
-    """Raise :class:`InputError` where the points do not move as what pulls them."""
+    """Raise :class:`InputError` if the points' motion does not correlate with the amounts."""
     if len(amounts) < 4 or np.ptp(amounts) == 0.0:
         return
     motion = np.nanmean(np.linalg.norm(field.displacement, axis=2), axis=1)

@@ -1,4 +1,4 @@
-r"""Data against what the model can predict: units that are wrong by factors, data that is zero.
+r"""The magnitude of data against the model's predictions: wrong units, data that are zero.
 
 Predictions :math:`g_s` are made at draws of the prior and at its ends, where they are smallest and
 largest. Data :math:`y` is refused as too small when for every one of them
@@ -131,7 +131,7 @@ def _closest(predict: Predict, name: str, data: np.ndarray, draws: np.ndarray) -
 def complaint(
     name: str, part: Observation, data: np.ndarray, predictions: np.ndarray, sd: float
 ) -> str | None:
-    """Return a line where data (...) is far from all of ``predictions`` (s, ...), else None."""
+    """Return a message if data (...) are far from all ``predictions`` (s, ...), else None."""
     y, g = np.ravel(data), predictions.reshape(len(predictions), -1)
     norms = np.array([_norm(row) for row in g])
     if not norms.min() > 0.0:

@@ -1,4 +1,4 @@
-"""What an observation is: measured numbers as a function of displacement and of theta.
+"""Observations: measured numbers as functions of displacement and of theta.
 
 A kind of observation is a declaration: its words, quantity, unit and columns, and the function
 ``evaluate``. It makes itself from a scene (``of``). Everything else is written once for all kinds:

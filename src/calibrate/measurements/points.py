@@ -1,4 +1,4 @@
-"""Observations at places of the body: what their words, columns and labels have in common.
+"""Observations at points of the body, with their words, columns and labels.
 
 The data of such an observation has one row for each place, and columns for the components of what
 was measured there.
@@ -62,7 +62,7 @@ class PointObservation(Observation):
 
     @property
     def selection(self) -> tuple[Any, ...]:
-        """The arguments of ``of`` but the places."""
+        """The arguments of ``of`` without the positions."""
         return tuple(getattr(self, argument) for argument in self.arguments)
 
     @classmethod
@@ -72,7 +72,7 @@ class PointObservation(Observation):
 
     @property
     def place_block(self) -> Block:
-        """The fields of the places in a file, with their arrays."""
+        """The fields of a file that hold the positions, with their arrays."""
         return [(self.place_field.named(*self.selection), getattr(self, self.place))]
 
     @classmethod

@@ -87,7 +87,7 @@ class Stress(Components):
         return part
 
     def _check_grips(self, shares: np.ndarray) -> None:
-        """Refuse components of which grips say nothing: all their shares are NaN."""
+        """Raise :class:`InputError` if a stress component is measured by no grip."""
         for component in self.components:
             _, row, column = _parts(component)
             if np.isnan(shares[:, row, column]).all():
@@ -141,7 +141,7 @@ class Stress(Components):
         return part, values
 
     def _check_signs(self, values: np.ndarray) -> None:
-        """Refuse a driven component that does negative work along the way from rest.
+        """Refuse a prescribed component that does negative work along the path from rest.
 
         One that moves less than a third of the largest may contract while it is pulled.
         """
@@ -159,7 +159,7 @@ class Stress(Components):
 
 
 def is_stress(word: str) -> bool:
-    """Return whether a column has stresses, or forces that become some."""
+    """Return whether a column holds stresses, or forces that are divided by areas."""
     name = with_unit(word)[0]
     return bool(_COMPONENT.fullmatch(name) or _PULL.fullmatch(name))
 

@@ -1,4 +1,4 @@
-r"""Stretches of a specimen under load control: what a machine that prescribes stresses measures.
+r"""Stretches of a specimen under load control, measured while stresses are prescribed.
 
 Where a table has ``applied_x``, the machine pulls along x with this first Piola-Kirchhoff stress
 (:mod:`emulator.specimens.states`), and the column ``stretch_x``, ``strain_x`` or ``green_x`` is

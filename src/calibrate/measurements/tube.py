@@ -1,4 +1,4 @@
-r"""What is measured of a tube: the pressure inside, and the force along it.
+r"""Measurements of a tube: the pressure inside, and the force along it.
 
 Both are integrals of the wall's stresses (:mod:`emulator.specimens.tube`), with
 :math:`\hat\sigma = P F^T / J`. Columns are ``pressure`` and ``force_axial``, the force besides that

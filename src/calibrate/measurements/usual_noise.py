@@ -1,4 +1,4 @@
-"""The noise of an observation that names none."""
+"""The default noise of observations."""
 
 from __future__ import annotations
 

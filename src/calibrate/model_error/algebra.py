@@ -37,13 +37,14 @@ def check_algebra(
     sizes : the different sizes that are not known, as of :attr:`Term.unknown_size`.
     gaussian, known : whether the noise has to be Gaussian, and its sd known.
     """
-    for name, each in noise.items():
-        if gaussian and not each.gaussian:
-            raise InputError(f"{what}: the noise of {name} must be Gaussian; it is {each.kind}")
-        if known and each.priors:
+    for name, noise_model in noise.items():
+        start = f"{what}: the noise of {name} must be"
+        if gaussian and not noise_model.gaussian:
+            raise InputError(f"{start} Gaussian; it is {noise_model.kind}")
+        if known and noise_model.priors:
             raise InputError(
-                f"{what}: the noise of {name} must be of known sd; {', '.join(each.priors)} is "
-                f"inferred; give a number, as in --noise {name}=SD"
+                f"{start} of known sd; {', '.join(noise_model.priors)} is inferred; give a number, "
+                f"as in --noise {name}=SD"
             )
     if len(sizes) > 1:
         reasons = " and ".join(sorted(sizes))

@@ -106,9 +106,9 @@ class RigidMotion:
     def systematic(self, name: str, measurement: Measurement) -> Systematic:
         """Return three shifts and three turns."""
         positions = {}
-        for each in measurement.named(self.of):
-            points, displacement = measurement.points(each)
-            positions[each] = points + displacement if self.at == "loaded" else points
+        for observation in measurement.named(self.of):
+            points, displacement = measurement.points(observation)
+            positions[observation] = points + displacement if self.at == "loaded" else points
         return rigid_motion(name, positions, self.shift, self.turn, self.about)
 
 
@@ -131,7 +131,7 @@ class Placement:
     def systematic(self, name: str, measurement: Measurement) -> Systematic:
         """Return one offset for each number."""
         names = measurement.named(self.of)
-        shapes = {measurement.shape(each) for each in names}
+        shapes = {measurement.shape(observation) for observation in names}
         if len(shapes) > 1:
             raise InputError(f"of: {', '.join(names)} have different numbers of points")
         sd = np.zeros(shapes.pop())
@@ -142,7 +142,7 @@ class Placement:
             points[row] = self.sd
         every = placement(name, names, sd)
         used = np.flatnonzero(np.ravel(sd))
-        modes = {each: modes[used] for each, modes in every.modes.items()}
+        modes = {observation: modes[used] for observation, modes in every.modes.items()}
         return Systematic(tuple(every.names[k] for k in used), modes)
 
 
@@ -166,12 +166,12 @@ class Pins:
     def systematic(self, name: str, measurement: Measurement) -> Systematic:
         """Return one offset along each axis."""
         modes = {}
-        for each in measurement.named(self.of):
-            points, displacement = measurement.points(each)
+        for observation in measurement.named(self.of):
+            points, displacement = measurement.points(observation)
             if len(points) < 3 or np.linalg.matrix_rank(points - points.mean(axis=0)) < 2:
-                raise InputError(f"of: '{each}' has no three markers, not on one line")
+                raise InputError(f"of: '{observation}' has no three markers, not on one line")
             rows = self.sd * (rotation_of(points, displacement) - np.eye(3)).T
-            modes[each] = np.repeat(rows[:, None], len(points), axis=1)
+            modes[observation] = np.repeat(rows[:, None], len(points), axis=1)
         return Systematic(tuple(f"{name} {axis}" for axis in "xyz"), modes)
 
 
@@ -192,7 +192,10 @@ class Gain:
     def systematic(self, name: str, measurement: Measurement) -> Systematic:
         """Return one factor."""
         names = measurement.named(self.of)
-        shares = {each: np.full((1, *measurement.shape(each)), self.share) for each in names}
+        shares = {
+            observation: np.full((1, *measurement.shape(observation)), self.share)
+            for observation in names
+        }
         return Systematic((name,), {}, shares=shares)
 
 
@@ -231,10 +234,12 @@ class Curve:
     def systematic(self, name: str, measurement: Measurement) -> Systematic:
         """Return as many unknowns as the curve can tell apart."""
         observations = measurement.named(self.of)
-        for each in observations:
-            if measurement.shape(each) != ():
-                raise InputError(f"of: '{each}' is not a single number, as a force is")
-        amounts = np.array([measurement.known(self.along, each) for each in observations])
+        for observation in observations:
+            if measurement.shape(observation) != ():
+                raise InputError(f"of: '{observation}' is not a single number, as a force is")
+        amounts = np.array(
+            [measurement.known(self.along, observation) for observation in observations]
+        )
         size = None if self.share_scale is None else ("curve_share", self.share_scale)
         unit = curve_modes(amounts, self.length, constant=self.constant)
         share = self.share if size is None else 1.0
@@ -245,9 +250,9 @@ class Curve:
         names = tuple(f"{name} {k + 1}" for k in range(int(used.sum())))
         return Systematic(
             names,
-            {each: modes[used, k] for k, each in enumerate(observations)},
+            {observation: modes[used, k] for k, observation in enumerate(observations)},
             size,
-            {each: shares[used, k] for k, each in enumerate(observations)},
+            {observation: shares[used, k] for k, observation in enumerate(observations)},
         )
 
 
@@ -294,10 +299,12 @@ class FieldError:
         observations = measurement.named(self.of)
         first = observations[0]
         points, components = measurement.points(first)[0], measurement.shape(first)[1]
-        for each in observations:
-            if not np.array_equal(measurement.points(each)[0], points):
-                raise InputError(f"of: '{each}' and '{first}' are of other points")
-        amounts = np.array([measurement.known(self.along, each) for each in observations])
+        for observation in observations:
+            if not np.array_equal(measurement.points(observation)[0], points):
+                raise InputError(f"of: '{observation}' and '{first}' are of other points")
+        amounts = np.array(
+            [measurement.known(self.along, observation) for observation in observations]
+        )
         if not np.abs(amounts).max() > 0.0:
             raise InputError(f"along: '{self.along}' is 0 in every state")
         along = np.ones((1, len(amounts)))
@@ -313,8 +320,7 @@ class FieldError:
         space, time = np.divmod(used, len(grown))
         kept = grown[time][:, :, None] * in_space[space][:, None, :]
         size = None if self.sd_scale is None else ("field_sd", self.sd_scale)
-        each_of = np.eye(components)
-        rows = np.einsum("rsd,ci->rcsdi", kept * (self.sd or 1.0), each_of)
+        rows = np.einsum("rsd,ci->rcsdi", kept * (self.sd or 1.0), np.eye(components))
         rows = rows.reshape(-1, len(amounts), len(points), components)
         names = tuple(f"{name} {k + 1}" for k in range(len(rows)))
         return Systematic(names, {n: rows[:, k] for k, n in enumerate(observations)}, size)

@@ -114,19 +114,19 @@ def rigid_motion(
     InputError
         Positions of another shape, or a negative standard deviation.
     """
-    points = {key: np.asarray(each, dtype=float) for key, each in positions.items()}
-    for key, each in points.items():
-        if each.ndim != 2 or each.shape[1] != 3 or not np.isfinite(each).all():
-            raise InputError(f"{name}: positions of '{key}' have shape {each.shape}; give (d, 3)")
+    points = {key: np.asarray(X, dtype=float) for key, X in positions.items()}
+    for key, X in points.items():
+        if X.ndim != 2 or X.shape[1] != 3 or not np.isfinite(X).all():
+            raise InputError(f"{name}: positions of '{key}' have shape {X.shape}; give (d, 3)")
     sds = [np.broadcast_to(np.asarray(sd, dtype=float), 3) for sd in (shift, turn)]
     if not all((sd >= 0.0).all() and np.isfinite(sd).all() for sd in sds):
         raise InputError(f"{name}: sds {shift} mm and {turn} degrees; they must be 0 or more")
     centre = np.concatenate(list(points.values())).mean(axis=0) if about is None else about
     axes = np.eye(3)[:, None]
     modes = {}
-    for key, each in points.items():
-        shifts = np.broadcast_to(sds[0] * axes, (3, *each.shape))
-        turns = np.deg2rad(sds[1])[:, None, None] * np.cross(axes, each - centre)
+    for key, X in points.items():
+        shifts = np.broadcast_to(sds[0] * axes, (3, *X.shape))
+        turns = np.deg2rad(sds[1])[:, None, None] * np.cross(axes, X - centre)
         modes[key] = np.concatenate([shifts, turns])
     names = tuple(f"{name} {motion} {axis}" for motion in ("shift", "turn") for axis in "xyz")
     return Systematic(names, modes)
@@ -143,9 +143,9 @@ def placement(name: str, observed: Sequence[str], sd: np.ndarray) -> Systematic:
     sd : standard deviation of each offset, of the data's shape, in their unit.
     """
     sd = np.asarray(sd, dtype=float)
-    each = np.diag(sd.ravel()).reshape(-1, *sd.shape)
+    offsets = np.diag(sd.ravel()).reshape(-1, *sd.shape)
     names = tuple(f"{name} {','.join(map(str, index))}" for index in np.ndindex(*sd.shape))
-    return Systematic(names, dict.fromkeys(observed, each))
+    return Systematic(names, dict.fromkeys(observed, offsets))
 
 
 def curve_correlation(amounts: jax.Array, length: Any, constant: float = 0.0) -> jax.Array:

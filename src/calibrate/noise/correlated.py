@@ -81,8 +81,8 @@ class SpatialModes:
             eigenvalues, Q = np.linalg.eigh(K)
             return np.maximum(eigenvalues, 0.0), Q  # round-off may be below 0
 
-        each = [decomposed(sites.positions[k].astype(float).tobytes()) for k in entries]
-        return cls(entries, tuple(Q for _, Q in each), np.concatenate([v for v, _ in each]))
+        modes = [decomposed(sites.positions[k].astype(float).tobytes()) for k in entries]
+        return cls(entries, tuple(Q for _, Q in modes), np.concatenate([v for v, _ in modes]))
 
     def to_data(self, z: jax.Array) -> jax.Array:
         """Return raveled data (..., e) from coordinates (..., e) along the modes."""
@@ -141,8 +141,8 @@ class SpatialNormal(dist.Distribution):
         residual = (value - self.centre).reshape(-1)
         precision = self.modes.diagonal(self.sds**-2)
         weighted = self.modes.to_data(self.modes.from_data(residual) / self.sds**2)
-        each = 0.5 * (jnp.log(precision / (2.0 * jnp.pi)) - weighted**2 / precision)
-        return each.reshape(self.centre.shape)
+        log_densities = 0.5 * (jnp.log(precision / (2.0 * jnp.pi)) - weighted**2 / precision)
+        return log_densities.reshape(self.centre.shape)
 
 
 @dataclass(frozen=True)

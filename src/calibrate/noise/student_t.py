@@ -53,7 +53,7 @@ class StudentTNoise(Noise):
 
     @property
     def upper_sd(self) -> float:
-        """Sd of the Gaussian that has as much mass beyond five of its own sds."""
+        """Sd of the Gaussian that has the same tail probability at five of its sds."""
         from scipy import stats  # the import takes half a second, and only this noise needs it
 
         beyond = float(stats.t.isf(stats.norm.sf(_FAR), self.dof))

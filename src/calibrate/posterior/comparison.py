@@ -11,8 +11,8 @@ the scores' own. It asks which model foretells another datum of this kind. The e
 .. math:: Z = \int p(y \mid \theta)\, p(\theta)\, d\theta
 
 asks which model, *prior included*, expected the data: halving the range of a parameter that the
-data fixes doubles it. Only tempered SMC estimates it. Neither says that the better model is good:
-that is what the misfit in a certificate is for.
+data fixes doubles it. Tempered SMC and the importance sampler estimate it. Neither score says that
+the better model is good: the misfit in a certificate does.
 
 Importance sampling fails where single data move the posterior far, as in a model that does not fit.
 Such a model can still lose: a datum is never less likely to the posterior that has seen it,

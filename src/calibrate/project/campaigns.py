@@ -100,7 +100,7 @@ def question(
 
 
 def fill(plan: Campaign, store: Any, *, progress: bool = False) -> int:
-    """Solve what a store, at a path or in memory, lacks; return how many rows were solved."""
+    """Solve the missing rows of a store, at a path or in memory, and return their number."""
     in_memory = isinstance(store, zarr.storage.MemoryStore)
     opened = nullcontext(ZarrRows(make_store(store, plan))) if in_memory else writing(store, plan)
     with opened as rows:

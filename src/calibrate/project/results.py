@@ -183,7 +183,7 @@ def holds_population(folder: str | Path) -> bool:
 
 
 def _content(folder: Path) -> str:
-    """Return a few words on what is in ``folder`` instead of results."""
+    """Describe the content of a ``folder`` without results."""
     if not folder.is_dir():
         return f"{folder} is a file" if folder.exists() else "there is no such folder"
     names = sorted(path.name for path in folder.iterdir())

@@ -24,6 +24,7 @@ from emulator.core.errors import InputError
 from emulator.core.schema import read_json_as
 from emulator.scenes.finer import CHANGES
 from emulator.surrogates import registry, shipped
+from emulator.surrogates.emulator import KINDS
 
 if TYPE_CHECKING:
     from calibrate.samplers import Sampler
@@ -66,8 +67,8 @@ class Run:
     check_scale : refuse data that is far from every prediction
         (:mod:`calibrate.measurements.magnitude`).
     forward : a name of :data:`emulator.surrogates.registry.FORWARD_MAPS`.
-    emulator : shipped name or folder of the emulator that the map is built from; by default the
-        one shipped for the scene.
+    emulator : shipped name or folder of the emulator that the map is built from, or the kind of
+        one shipped for the scene, ``series`` or ``physics``; by default its graph network.
     forward_options : the map's options by name, e.g. ``{"fem_runs": 60}``.
     error_runs : FEM runs (8 or more) from which the forward map's own error is learned, so that a
         poor map widens the posterior instead of moving it; 0 takes the map as exact.
@@ -218,7 +219,7 @@ def with_absolute_paths(entries: Mapping[str, Any], folder: Path = Path()) -> di
         return word if word == SYNTHETIC else path(word)
 
     def emulator(word: str) -> str:
-        return word if word in shipped() else path(word)
+        return word if word in (*shipped(), *KINDS) else path(word)
 
     def prior(word: str | dict[str, Any]) -> str | dict[str, Any]:
         if isinstance(word, str) and word.endswith(".json"):

@@ -41,7 +41,7 @@ _Sizes = dict[str, tuple[SpecimenCurves, float]]  # each measurement, and its la
 
 
 class SpecimenDraft(NamedTuple):
-    """Files that were written.
+    """The scene file and the experiment file that were written.
 
     path, scene_path : the experiment file, and the scene file that it names.
     scene : the specimen that the latter describes.
@@ -84,19 +84,19 @@ def draft_specimen(
     if not table.is_file():
         raise InputError(f"data file {table} does not exist")
     cells = read_cells(table)
-    given = read_states(cells, tube)
-    largest, slope = _size(cells, given, tube)
-    moved = (np.diagonal(given.gradients, axis1=1, axis2=2) != 0.0) | (given.pulls != 0.0)
-    axes = [axis for axis, own in zip(AXES, moved.T, strict=True) if own.any()]
+    states = read_states(cells, tube)
+    largest, slope = _size(cells, states, tube)
+    motion = (np.diagonal(states.gradients, axis1=1, axis2=2) != 0.0) | (states.pulls != 0.0)
+    axes = [axis for axis, column in zip(AXES, motion.T, strict=True) if column.any()]
     chosen = "holzapfel_gasser_ogden" if len(axes) > 1 else "holzapfel_ogden_isotropic"
     material = find_law(law or chosen)
     of_law = f"law {material.name}" + ("" if law else ": a guess, give --law NAME")
-    notes = _notes(cells, given, of_law, largest, slope, tube)
+    notes = _notes(cells, states, of_law, largest, slope, tube)
     folder = scene_path.resolve().parent
     source = table.resolve()
     name = source.relative_to(folder) if source.is_relative_to(folder) else source
     scene_path.parent.mkdir(parents=True, exist_ok=True)
-    pulled = bool(given.pulls.any())
+    pulled = bool(states.pulls.any())
     text = _scene_text(material, name.as_posix(), axes, slope, tube, pulled=pulled)
     if tube is None and not pulled:
         text += "\n".join(["", *_GRIPS, ""])
@@ -111,11 +111,11 @@ def draft_specimen(
 
 
 def _notes(
-    cells: Cells, given: States, of_law: str, largest: _Sizes, slope: float, tube: Tube | None
+    cells: Cells, states: States, of_law: str, largest: _Sizes, slope: float, tube: Tube | None
 ) -> list[str]:
-    """Return a sentence for each thing that was read or guessed; ``of_law`` is that on the law."""
+    """Return one sentence per value that was read or guessed; ``of_law`` is the one on the law."""
     notes = [
-        f"{len(given.free) // (tube.size if tube else 1)} states in {_tests(given)}",
+        f"{len(states.free) // (tube.size if tube else 1)} states in {_tests(states)}",
         of_law,
         *(
             f"{name} reaches {part.at_rest + most:.3g} {part.unit}".removesuffix(" 1")
@@ -141,19 +141,19 @@ def _notes(
     return notes
 
 
-def _tests(given: States) -> str:
-    names = [name for name in given.protocols if name]
+def _tests(states: States) -> str:
+    names = [name for name in states.protocols if name]
     return f"{len(names)} tests ({', '.join(names)})" if len(names) > 1 else "one test"
 
 
-def _size(cells: Cells, given: States, tube: Tube | None) -> tuple[_Sizes, float]:
+def _size(cells: Cells, states: States, tube: Tube | None) -> tuple[_Sizes, float]:
     """Return the size of each measurement, and the tissue's stiffness in kPa.
 
     A stress over the motion there, where it is largest, either measured or prescribed; of a tube,
     the stress of a thin wall, pressure times inner radius over thickness, or force over section.
     """
     neutral = specimen(
-        given, law=find_law("neo_hookean_split"), tube=tube,
+        states, law=find_law("neo_hookean_split"), tube=tube,
         parameters=(Parameter("mu", "kPa", 1.0, 10.0),), constants={
             "kappa": 10.0, **dict.fromkeys(_stiffnesses(tube), 1.0)},
     )  # fmt: skip
@@ -181,8 +181,8 @@ def _size(cells: Cells, given: States, tube: Tube | None) -> tuple[_Sizes, float
         area = np.pi * (tube.outer_radius**2 - tube.inner_radius**2)
         thin = tube.inner_radius / sum(tube.layers)
         stress = stress * (thin if first == TubePressure.name else 1.0 / area)
-    moved = motion > 0.1 * motion.max()
-    return sizes, float((stress[moved] / motion[moved]).max())
+    rows = motion > 0.1 * motion.max()
+    return sizes, float((stress[rows] / motion[rows]).max())
 
 
 def _stiffnesses(tube: Tube | None) -> list[str]:

@@ -53,8 +53,8 @@ def find_sampler(name: str | None, options: Any | None = None) -> Sampler:
         An unknown name; the known ones are given.
     """
     if name is None:
-        own = (sampler for sampler in _ALL if sampler.options is type(options))
-        return next(own, AUTO)
+        samplers = (sampler for sampler in _ALL if sampler.options is type(options))
+        return next(samplers, AUTO)
     return look_up(SAMPLERS, name, "sampler")
 
 

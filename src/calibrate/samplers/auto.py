@@ -31,7 +31,7 @@ class AutoOptions(NUTSOptions):
 
 
 class Auto(Sampler):
-    """The sampler that chooses another."""
+    """The sampler that chooses between importance sampling and NUTS."""
 
     def sample(self, density: Density, data: Data, options: AutoOptions, context: Context) -> Draws:
         """Return the draws of the sampler named by the attribute ``sampled_by``.
@@ -54,7 +54,7 @@ class Auto(Sampler):
 def _by_importance(
     density: Density, data: Data, options: AutoOptions, context: Context
 ) -> Draws | str:
-    """Return the draws of importance sampling, or why they are not to be used."""
+    """Return the draws of importance sampling, or the reason to reject them."""
     if density.dimension > MOST_UNKNOWNS:
         return f"{density.dimension} unknowns; up to {MOST_UNKNOWNS} are few"
     if not density.batches:
@@ -71,7 +71,7 @@ def _by_importance(
 
 
 def _for(sampler: Sampler, options: AutoOptions) -> Any:
-    """Return the options of a sampler that ``options`` has, too; its own defaults for others."""
+    """Return a sampler's options: from ``options`` where it has them, else the defaults."""
     names = {field.name for field in fields(sampler.options)} & {f.name for f in fields(options)}
     return sampler.options(**{name: getattr(options, name) for name in names})
 

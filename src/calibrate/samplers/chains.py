@@ -210,8 +210,8 @@ class Chains:
         """Begin at a mode, in units of its curvature."""
         assert isinstance(self.density, Density)
         starts = prior_draws(self.density, key, _STARTS)
-        if (found := white_at_mode(self.density, self.data, starts)) is not None:
-            mode, root = map(jnp.asarray, found)
+        if (whitening := white_at_mode(self.density, self.data, starts)) is not None:
+            mode, root = map(jnp.asarray, whitening)
             self.map_ = self.map_._replace(centre=mode, root=root)
 
     def draw(self, total: int) -> Draws:

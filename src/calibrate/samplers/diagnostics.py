@@ -1,4 +1,4 @@
-"""How good draws are: R-hat and effective sample sizes of chains.
+"""Convergence diagnostics of chains: R-hat and effective sample sizes.
 
 R-hat and effective sample size have limits for three uses. A run goes on until it meets the first
 limits, a posterior that misses the second carries a warning, and one that misses the third gets no

@@ -233,7 +233,7 @@ class _Run:
 
         share : the share of the mode in the mass of all.
         """
-        if any(own.is_at(mode.z, mode.height) for own in self.modes):
+        if any(peak.is_at(mode.z, mode.height) for peak in self.modes):
             return True
         inside = mode.distances(self.points.z) < len(mode.z) + 4.0 * np.sqrt(2.0 * len(mode.z))
         return float(normalised(self.points.log_weights)[inside].sum()) > _HOLDS * share

@@ -105,7 +105,7 @@ class Ends(NamedTuple):
 def climb_from(
     density: Density, data: Data, starts: np.ndarray, draws: np.ndarray | None = None
 ) -> Ends:
-    """Return where L-BFGS ends from points ``starts`` (m, p); none where the density is zero.
+    """Return the ends of L-BFGS from points ``starts`` (m, p); none where the density is zero.
 
     draws : draws (s, p) of the posterior, if there are any; in coordinates in which they are white
         the optimiser takes a few steps, where a sharp posterior takes thousands.
@@ -120,7 +120,7 @@ def climb_from(
 def _climber(
     density: Density, data: Data, draws: np.ndarray | None
 ) -> Callable[..., tuple[np.ndarray, float]]:
-    """Return the function from a start (p,) to where a climb ends, and the log density there.
+    """Return the function from a start (p,) to the end of a climb and its log density.
 
     A climb that comes to one of the modes ``known`` ends there.
     """
@@ -201,7 +201,7 @@ def merged(modes: Iterable[Mode]) -> list[Mode]:
 
 
 def of_account(modes: Sequence[Mode]) -> list[Mode]:
-    """Return the modes that are not lighter than a thousandth of the first, the heaviest."""
+    """Return the modes of at least a thousandth of the mass of the first, the heaviest."""
     return [mode for mode in modes if mode.log_mass > modes[0].log_mass - _NEGLIGIBLE]
 
 

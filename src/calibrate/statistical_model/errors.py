@@ -78,7 +78,7 @@ def with_systematic(model: Model, *errors: Systematic) -> Model:
 def with_described_errors(
     model: Model, data: Mapping[str, Any], descriptions: Mapping[str, Mapping[str, Any]]
 ) -> tuple[Model, Mapping[str, jax.Array]]:
-    """Return ``model`` of the values that are not missing, with the described errors, and these.
+    """Return ``model`` of the present values with the described errors, and these values.
 
     data : the data by the observation's name, NaN where missing.
     descriptions : the description of each error as in an experiment file, by the error's name.
@@ -100,7 +100,7 @@ def errors_of_data(
 
     :class:`InputError` where an error does not fit, by its name; and as :func:`with_systematic`.
     """
-    kinds = {name: read_systematic(name, each) for name, each in descriptions.items()}
+    kinds = {name: read_systematic(name, description) for name, description in descriptions.items()}
     check_algebra("systematic errors", model.noise)
     parameters = model.forward.scene.parameter_names
     states = zip(model.states.states, model.states.entries, strict=True)
@@ -182,11 +182,11 @@ def with_error(
         """Return FEM's data, flat (m,); None where it does not converge."""
         if finer is not None:
             try:
-                found = finer(draw, known)
+                pair = finer(draw, known)
             except SolverError:
                 return None
-            known.extend(found.estimates)
-            return found.fine
+            known.extend(pair.estimates)
+            return pair.fine
         if (fields := next(fem.equilibria([draw]))[1]) is None:
             return None
         seen = jnp.stack([u[model.observe.nodes] for u in fields])
@@ -235,7 +235,7 @@ def map_errors(
     draws: Mapping[str, np.ndarray],
     data: Mapping[str, Any],
 ) -> MapErrors:
-    """Return what the map's errors do to a posterior.
+    """Return the sizes of the map's errors, and the moves of posterior means that follow.
 
     A Newton step at a few draws and at points around them tells FEM's answer, where the step's own
     check accepts it. Where it accepts fewer than four at draws, FEM runs make it four, and there
@@ -278,8 +278,8 @@ def map_errors(
         refused = [z for z, step in zip(points, steps, strict=True) if step is None]
         asked = np.linspace(0, len(refused) - 1, min(runs, len(refused))).astype(int)
         solved = [answer(refused[k], by_fem) for k in asked]
-        found = [each for each in (*steps, *solved) if each is not None]
-        return found, any(each is None for each in solved)
+        answers = [a for a in (*steps, *solved) if a is not None]
+        return answers, any(a is None for a in solved)
 
     z = predictive.unconstrain(draws)
     rows = np.linspace(0, len(z) - 1, count + 2)[1:-1].astype(int)
@@ -287,14 +287,14 @@ def map_errors(
     if failed or len(known) < _FEWEST_ANSWERS:
         sizes = dict.fromkeys(observe.parts, np.inf) if failed else {}
         return MapErrors(sizes, np.inf if failed else np.nan)
-    sizes = in_noise_sd(model, np.array([each.error for each in known]), draws)
+    sizes = in_noise_sd(model, np.array([a.error for a in known]), draws)
     some = z[np.linspace(0, len(z) - 1, min(_CLOUD, len(z))).astype(int)]
     left = [_FEWEST_ANSWERS]
 
     def ask_further(points: np.ndarray) -> list[FEMAnswer]:
-        found, _ = ask(points, left[0])
-        left[0] -= min(left[0], len(points) - len(found))
-        return found
+        answers, _ = ask(points, left[0])
+        left[0] -= min(left[0], len(points) - len(answers))
+        return answers
 
     return MapErrors(sizes, largest_move(predictive, some, known, ask_further, count, rng))
 
@@ -313,8 +313,8 @@ def in_noise_sd(
         return {}
     unravel = ravel_pytree({name: jnp.zeros(n) for name, n in model.observe.shapes.items()})[1]
     sizes, sds = {}, noise_sds(model, draws)
-    for name, each in jax.vmap(unravel)(jnp.asarray(errors)).items():
-        square = np.square(np.asarray(each).reshape(len(errors), -1))
+    for name, values in jax.vmap(unravel)(jnp.asarray(errors)).items():
+        square = np.square(np.asarray(values).reshape(len(errors), -1))
         sizes[name] = float(np.median(np.sqrt(square.mean(axis=1))) / sds[name])
     return sizes
 
@@ -322,7 +322,7 @@ def in_noise_sd(
 def fit(
     unknowns: np.ndarray, errors: np.ndarray, information: np.ndarray, *, of_mesh: bool = False
 ) -> Term:
-    """Return the error that FEM runs show.
+    """Fit the forward map's error to FEM runs.
 
     unknowns : the unknowns at which FEM was run, (n, q).
     errors : FEM's data less the map's, all observations raveled, (n, d).

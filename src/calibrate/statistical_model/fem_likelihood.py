@@ -97,8 +97,8 @@ class FEMLikelihood:
             fem, means, smallest_J = self._fem(jnp.stack(fields), thetas, dict(draw), data)
             stable = self._stable(fields, thetas) if number in stability else None
             derivatives = self._slopes(fields, thetas) if slopes else None
-            found = (float(fem), cheap, True, float(smallest_J), means, stable, derivatives)
-            yield number, Likelihoods(*found)
+            values = (float(fem), cheap, True, float(smallest_J), means, stable, derivatives)
+            yield number, Likelihoods(*values)
 
     def equilibria(
         self, draws: Sequence[Mapping[str, Any]]
@@ -151,13 +151,13 @@ class FEMLikelihood:
         """Return derivatives (m, S, p) of the flat means, by those of the equilibria."""
         nodes = self.model.observe.nodes
         try:
-            each = [
+            du = [
                 self.simulator.sensitivities(u, theta)[:, nodes]
                 for u, theta in zip(fields, thetas, strict=True)
             ]
         except SolverError:
             return None
-        return np.asarray(self._derivatives(jnp.stack(fields)[:, nodes], jnp.stack(each), thetas))
+        return np.asarray(self._derivatives(jnp.stack(fields)[:, nodes], jnp.stack(du), thetas))
 
     def _slopes_of_means(self, u: jax.Array, slopes: jax.Array, thetas: jax.Array) -> jax.Array:
         """Return derivatives (m, S, p), from u (S, k, 3) and du/dtheta (S, p, k, 3) there."""

@@ -1,4 +1,4 @@
-"""FEM that is closer to what was measured: on a finer mesh, or of a specimen between its grips."""
+"""FEM of higher fidelity than a model's: on a finer mesh, or of a specimen between its grips."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class MeshPair(NamedTuple):
 
 
 class FinerFEM(Protocol):
-    """FEM that is closer to what was measured than a model's own."""
+    """FEM of higher fidelity than a model's simulator."""
 
     @property
     def nodes(self) -> int:
@@ -64,7 +64,7 @@ class FinerFEM(Protocol):
 
 
 def finer_fem(model: Model, simulator: EquilibriumSolver) -> FinerFEM:
-    """Return the FEM that is closer to what was measured.
+    """Return the FEM of higher fidelity than the model's simulator.
 
     Raises
     ------
@@ -103,12 +103,12 @@ class _OnFinerMesh:
 
     def __call__(self, draw: Mapping[str, Any], known: Known = ()) -> MeshPair:
         """Return the data; solves start from ``known`` and from the draw's earlier states."""
-        thetas, own = self.model.states.thetas(draw), list[MeshErrorEstimate]()
+        thetas, estimates = self.model.states.thetas(draw), list[MeshErrorEstimate]()
         for theta in thetas:
-            own.append(self.error(theta, self._start(theta), known=[*known, *own]))
-        fine = flat_data(self.observe, [each.fine for each in own], thetas)
-        coarse = flat_data(self.model.observe, [each.coarse for each in own], thetas)
-        return MeshPair(fine, coarse, own)
+            estimates.append(self.error(theta, self._start(theta), known=[*known, *estimates]))
+        fine = flat_data(self.observe, [e.fine for e in estimates], thetas)
+        coarse = flat_data(self.model.observe, [e.coarse for e in estimates], thetas)
+        return MeshPair(fine, coarse, estimates)
 
     @cached_property
     def _start(self) -> Callable[[jax.Array], jax.Array]:

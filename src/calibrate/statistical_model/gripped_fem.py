@@ -1,4 +1,4 @@
-"""FEM of a specimen between its grips, which is closer to the measurement than its states."""
+"""FEM of a specimen between its grips, of higher fidelity than homogeneous states."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class GrippedFEM:
         return self.gripped.workers
 
     def __call__(self, draw: Mapping[str, Any], known: Known = ()) -> MeshPair:  # noqa: ARG002
-        """Return the data; what grips add is a share of the homogeneous stresses."""
+        """Return the data; the grips' stresses are fractions of the homogeneous ones."""
         (theta,) = self.model.states.thetas(draw)
         solution = self.gripped.homogeneous.solve(theta).require_converged("the specimen")
         fields, thetas = [solution.displacement], theta[None]

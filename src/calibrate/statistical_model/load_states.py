@@ -89,7 +89,7 @@ def load_states(
 def boxed(
     states: LoadStates, prior: Collection[str] | None, bounded: Collection[str]
 ) -> frozenset[str]:
-    """Return the unknowns whose range stands for a prior, and may be a guess.
+    """Return the unknowns whose prior is their parameter's range, which may be a guess.
 
     Parameters
     ----------

@@ -291,7 +291,7 @@ class Model:
     def given(
         self, data: np.ndarray | Mapping[str, np.ndarray]
     ) -> tuple[Model, dict[str, jax.Array]]:
-        """Return the model of the values that are not missing (NaN), and these, checked.
+        """Return the model of the values that are not missing (NaN), and these values after checks.
 
         :class:`InputError` as :meth:`check_data`, or where every value of an observation is
         missing.
@@ -409,7 +409,7 @@ def model(
         forward=restricted,
         full=forward,
         observe=several,
-        noise=at_sites({name: each for name, (_, each) in expanded.items()}, several),
+        noise=at_sites({name: noise_model for name, (_, noise_model) in expanded.items()}, several),
         noise_names={name: source for name, (source, _) in expanded.items()},
         states=states,
         prior=cut_priors,

@@ -1,4 +1,4 @@
-r"""By how much FEM in place of the forward map would move posterior means, from few answers of FEM.
+r"""Moves of posterior means by FEM in place of the forward map, estimated from a few FEM solves.
 
 A map that is right where its posterior has draws may be wrong where it has none, and its posterior
 then lacks a part. So FEM is asked at draws, around them, a Gauss-Newton step up its own posterior
@@ -65,7 +65,7 @@ def largest_move(
     """
     rows, answers, surprises = len(answers) + _ROUNDS * count, list(answers), list[float]()
     correction = _fitted(predictive, answers, rows)
-    told, fresh = len(answers), list[FEMAnswer]()
+    known, fresh = len(answers), list[FEMAnswer]()
     for round_ in ("around", "uphill", "pool"):
         if round_ == "around":
             points = Kernels.surrounding(z, rng).sample(rng, count)
@@ -85,7 +85,7 @@ def largest_move(
     pool = Pool.search(predictive, correction, z, (), rng)
     heights = _heights(predictive, answers)
     likely = heights > np.max(heights) - _LIKELY - 0.5 * z.shape[1]
-    if np.any(likely[told:] & (np.array(surprises) > _SURPRISE)):
+    if np.any(likely[known:] & (np.array(surprises) > _SURPRISE)):
         return np.inf
     moves = (pool.corrected - normalised(pool.log_cheap)) @ predictive.columns(pool.z)
     draws = predictive.columns(z)
@@ -108,7 +108,7 @@ def _heights(predictive: Predictive, answers: list[FEMAnswer]) -> np.ndarray:
 
 
 def _fitted(predictive: Predictive, answers: list[FEMAnswer], rows: int) -> Correction:
-    """Return the correction that the answers teach, of the shape of one of ``rows`` points."""
+    """Fit a correction to FEM's answers, with arrays of the shapes for ``rows`` points."""
     features = predictive.features(np.array([answer.z for answer in answers]))
     errors = np.array([answer.error for answer in answers])
     heights = _heights(predictive, answers)

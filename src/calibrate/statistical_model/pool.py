@@ -57,7 +57,7 @@ class Pool(WeightedPoints):
         modes: tuple[np.ndarray, ...],
         rng: np.random.Generator,
     ) -> Pool:
-        """Return a pool that covers the draws (s, p) of z, and where the prior leads to.
+        """Return weighted points that cover draws z (s, p) and the modes found from prior draws.
 
         modes : points around each further mode of FEM.
         """
@@ -95,7 +95,7 @@ class Pool(WeightedPoints):
 
     @property
     def log_explored(self) -> np.ndarray:
-        """Log weights (s,) of where FEM may find the data likely, up to a constant.
+        """Log weights (s,) that favour points where FEM may find the data likely, up to a constant.
 
         The gap of a corrected log likelihood to the best one counts :math:`1 / (1 + v)` times, with
         the correction's variance :math:`v`: as if the noise had the correction's error added.

@@ -1,4 +1,4 @@
-"""What every other package stands on, and what knows nothing of mechanics or statistics.
+"""The foundation of all other packages, without mechanics or statistics.
 
 ==================  ==========================================================================
 ``errors``          errors of one line, and the one wording of an unknown name

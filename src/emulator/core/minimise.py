@@ -20,7 +20,7 @@ ValueAndGradient = Callable[[np.ndarray], tuple[Any, Any]]
 
 
 class Minimum(NamedTuple):
-    """Where a minimisation ended.
+    """The end of a minimisation.
 
     x : the point, (q,).
     value : the function's value at ``x``; infinite if no finite value was found.

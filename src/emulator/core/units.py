@@ -32,8 +32,8 @@ IN_ML = {"mL": 1.0, "ml": 1.0, "cm3": 1.0, "mm3": 1e-3, "uL": 1e-3, "µL": 1e-3,
 
 def with_unit(word: str) -> tuple[str, str]:
     """Return the name and the unit of a column such as ``stress_x [kPa]``; no unit is empty."""
-    found = _WITH_UNIT.fullmatch(word.strip())
-    return (found[1], found[2] or "") if found else (word, "")
+    match = _WITH_UNIT.fullmatch(word.strip())
+    return (match[1], match[2] or "") if match else (word, "")
 
 
 def factor(word: str, unit: str, usual: str, known: Mapping[str, float]) -> float:
@@ -42,7 +42,7 @@ def factor(word: str, unit: str, usual: str, known: Mapping[str, float]) -> floa
     :class:`InputError` for a unit that is not ``known``.
     """
     plain = unit.replace("²", "2").replace("³", "3").replace("^", "").replace(" ", "") or usual
-    alike = [each for each in known if each.lower() == plain.lower()]
+    alike = [name for name in known if name.lower() == plain.lower()]
     if plain not in known and len(alike) == 1 and not plain.startswith("m"):
         (plain,) = alike
     if plain not in known:

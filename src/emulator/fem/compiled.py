@@ -104,10 +104,11 @@ class _Program:
 class SharedPrograms:
     """The programs of this process by their text before XLA compiles it.
 
-    This is the only process-wide state of the solver. A program is dropped with the last body that
-    uses it. The text holds shapes, types and operations, no arrays: which program a body gets never
-    changes its numbers. Without JAX's cache on disk, the first solve of a second coarse ventricle
-    took 5 s where that of the first took 126 s (two busy cores).
+    Beside the factors that SuiteSparse keeps (:mod:`emulator.fem.linear.suitesparse`) they are the
+    process-wide state of the solver. A program is dropped with the last body that uses it. The text
+    holds shapes, types and operations, no arrays: which program a body gets never changes its
+    numbers. Without JAX's cache on disk, the first solve of a second coarse ventricle took 5 s
+    where that of the first took 126 s (two busy cores).
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""The effects that a scene can do without, and the scene without each of them.
+"""The effects that may be left out of a scene, and the scene without each of them.
 
 Laws, loads and supports say which of their effects can be left out, and what stands in its place.
 The scene adds the order of the elements, mean or patch dilatation, and regions of different

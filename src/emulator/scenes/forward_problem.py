@@ -1,4 +1,4 @@
-"""What scenes and specimens have in common: a law, its parameters, and theta in its box.
+"""The base of scenes and specimens: a law, its parameters, and theta in its box.
 
 A :class:`~emulator.scenes.scene.Scene` adds a mesh with loads and supports, a
 :class:`~emulator.specimens.specimen.Specimen` the homogeneous states of a piece of tissue. Forward

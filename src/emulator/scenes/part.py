@@ -172,7 +172,7 @@ class Load(Part):
 
     @property
     def at_held_nodes(self) -> Load:
-        """The load whose force is right at prescribed nodes, too.
+        """The same load with its reactions at prescribed nodes included.
 
         A potential only has to be right for nodes that are free.
         """

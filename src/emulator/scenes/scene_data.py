@@ -123,8 +123,8 @@ class SceneData(ForwardProblem):
     @property
     def load_parameters(self) -> tuple[str, ...]:
         """Entries of theta that belong to loads or move supports; the others are the body's."""
-        own = (load for load in self.loads if not load.shared)
-        names = {quantity.name for load in own for quantity in load.quantities}
+        loads = (load for load in self.loads if not load.shared)
+        names = {quantity.name for load in loads for quantity in load.quantities}
         names |= set(self.prescribed.per_unit)
         return tuple(parameter.name for parameter in self.parameters if parameter.name in names)
 

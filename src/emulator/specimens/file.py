@@ -1,4 +1,4 @@
-"""What scene files say of a specimen: its table, its tube and its grips (``docs/specimens.md``)."""
+"""The entries of a specimen in scene files: its table, tube and grips (``docs/specimens.md``)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-r"""Stresses of specimens as they were gripped: FEM of the piece, and what is learned from it.
+r"""Stresses of gripped specimens: FEM of the piece, and polynomials of theta fitted to it.
 
 Each test is followed state by state. Where stretches were measured between marks, the grips'
 displacements q are unknown, and Newton's method finds those at which the marks' gradient M is the
@@ -53,14 +53,14 @@ _FEWEST = 10  # theta
 
 
 def added(P: jax.Array, shares: jax.Array) -> jax.Array:
-    """Return stresses (m, 3, 3) with what grips add, ``shares`` (m, 3, 3) of each one's norm."""
+    """Return stresses P (m, 3, 3) plus ``shares`` (m, 3, 3) of their norms, which grips add."""
     square = jnp.sum(P**2, axis=(1, 2), keepdims=True)
     loaded = square > 0.0  # at rest the root has no derivative
     return P + jnp.where(loaded, jnp.sqrt(jnp.where(loaded, square, 1.0)), 0.0) * shares
 
 
 def gripped_stresses(scene: Specimen, P: jax.Array, theta: jax.Array) -> jax.Array:
-    """Return homogeneous stresses (m, 3, 3) with what the scene's grips add, if it was learned."""
+    """Return homogeneous stresses (m, 3, 3) plus those of the scene's grips, if learned."""
     if scene.grips is None or (learned := scene.grips.learned) is None:
         return P
     if learned.of != of_grips(scene):
@@ -140,13 +140,13 @@ class GrippedSpecimen:
         theta = jnp.asarray(theta, dtype=float)
         P = np.full(self.states.gradients.shape, np.nan)
         for name, test in self.states.protocols.items():
-            own = test if rows is None else test[np.isin(test, rows)]
-            for row, at in zip(own, self.path(name, theta, own), strict=True):
+            selection = test if rows is None else test[np.isin(test, rows)]
+            for row, at in zip(selection, self.path(name, theta, selection), strict=True):
                 P[row] = self._force(self.pieces[name], theta, at)
         return P
 
     def shares(self, theta: jax.Array) -> np.ndarray:
-        """Return what grips add to each state, (m, 3, 3), as shares of its homogeneous stress.
+        """Return the stress that grips add to each state, (m, 3, 3), over its homogeneous norm.
 
         At most six states of a test are solved; those between them are interpolated.
 
@@ -162,11 +162,11 @@ class GrippedSpecimen:
         shares = np.full_like(P, np.nan)
         for name, rows in protocols.items():
             known = solved[name]
-            own = (P[known] - even[known]) / sizes[known, None, None]
+            excess = (P[known] - even[known]) / sizes[known, None, None]
             acting = self.pieces[name].acting
             if len(known) > 1:
-                own = PchipInterpolator(paths[known], np.where(acting, own, 0.0))(paths[rows])
-            shares[rows] = np.where(acting, own, np.nan)
+                excess = PchipInterpolator(paths[known], np.where(acting, excess, 0.0))(paths[rows])
+            shares[rows] = np.where(acting, excess, np.nan)
         return shares
 
     def path(
@@ -178,15 +178,15 @@ class GrippedSpecimen:
 
         :class:`SolverError` where FEM does not converge in one of them.
         """
-        piece, own = self.pieces[test], self.states.protocols[test] if rows is None else rows
-        at = GrippedState(np.zeros(len(piece.moved)), self.simulators[piece].rest, None)
-        found = []
-        for H in self.states.gradients[own]:
+        piece, selection = self.pieces[test], self.states.protocols[test] if rows is None else rows
+        at = GrippedState(np.zeros(len(piece.components)), self.simulators[piece].rest, None)
+        path = []
+        for H in self.states.gradients[selection]:
             target = H[piece.rows, piece.columns]
             if target.any():
                 at = self._follow(piece, jnp.asarray(theta, dtype=float), target, at)
-            found.append(at)
-        return found
+            path.append(at)
+        return path
 
     def _force(self, piece: Piece, theta: jax.Array, at: GrippedState) -> np.ndarray:
         """Return the stress (3, 3) in kPa that acts on the grips."""
@@ -237,7 +237,7 @@ def _spread(rows: np.ndarray, sizes: np.ndarray, paths: np.ndarray) -> np.ndarra
 def learn_grips(
     specimen: Specimen, runs: int = RUNS, *, seed: int = 0, progress: bool = False
 ) -> GripStresses:
-    """Return what grips add to a specimen's stresses, from FEM at ``runs`` theta of its box.
+    """Learn the stresses that grips add to a specimen's, from FEM at ``runs`` theta of its box.
 
     Theta at which FEM fails are left out.
 
@@ -258,16 +258,16 @@ def learn_grips(
             return None
 
     with counting(total=runs, desc="gripped FEM", disable=not progress, unit="run") as bar:
-        found = []
+        outcomes = []
         for shares in in_order(solve, iter(thetas), gripped.workers):
-            found.append(shares)
+            outcomes.append(shares)
             bar.update()
-    rows = np.array([k for k, shares in enumerate(found) if shares is not None], dtype=int)
+    rows = np.array([k for k, shares in enumerate(outcomes) if shares is not None], dtype=int)
     if len(rows) < _FEWEST:
         raise InputError(
             f"FEM of the gripped piece converged at {len(rows)} of {runs} theta; narrow the ranges"
         )
-    shares = np.stack([each for each in found if each is not None])
+    shares = np.stack([values for values in outcomes if values is not None])
     flat = np.nan_to_num(shares.reshape(len(rows), -1))
     samples = Samples(np.asarray(specimen.to_unit(thetas[rows])), flat, np.zeros(len(rows)))
     degree, error = _best(samples, ~np.isnan(shares[0]).ravel())
@@ -300,6 +300,6 @@ def of_grips(specimen: Specimen) -> str:
     grips = specimen.grips
     assert grips is not None
     apart = ("size", "learned")  # an array of its own, and what the hash is kept with
-    words = tuple(getattr(grips, each.name) for each in fields(grips) if each.name not in apart)
+    words = tuple(getattr(grips, field.name) for field in fields(grips) if field.name not in apart)
     free = replace(specimen, grips=None)
     return fingerprint_of("grips", free.fingerprint, repr(words), np.asarray(grips.size))

@@ -1,4 +1,4 @@
-"""How a specimen was held in a testing machine, and what that does to its stresses."""
+"""The grips of a testing machine, and the stresses that they add to a specimen's."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from emulator.core.store import read_arrays, save_arrays
 
 @dataclass(frozen=True, eq=False)
 class GripStresses:
-    r"""What the grips add to the stresses of homogeneous states, as polynomials of theta.
+    r"""The stresses that grips add to those of homogeneous states, as polynomials of theta.
 
     Of each state, :math:`P = P_h + |P_h| \sum_\alpha c_\alpha \varphi_\alpha(x)` with the
     homogeneous stress :math:`P_h` (Frobenius norm), theta's position x in its box, and the
@@ -32,13 +32,13 @@ class GripStresses:
     of: str
 
     def write(self, path: str | Path) -> None:
-        """Write a safetensors file."""
+        """Write the polynomials to a safetensors file."""
         words = {"error": repr(self.error), "of": self.of}
         save_arrays(path, {"degrees": self.degrees, "shares": self.shares}, words)
 
     @classmethod
     def read(cls, path: str | Path) -> GripStresses:
-        """Return what a file says; :class:`InputError` where it is of another kind."""
+        """Read the polynomials from a file; :class:`InputError` for a file of another kind."""
         arrays, words = read_arrays(path)
         if set(arrays) != {"degrees", "shares"} or set(words) != {"error", "of"}:
             raise InputError(f"{path} is not what grips do to a specimen; train its scene again")

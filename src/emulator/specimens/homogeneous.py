@@ -231,7 +231,7 @@ def equilibrium(
     axes : the axes (u,) of the stretches that minimise the energy; 3 for none.
     last : the axis of the stretch that keeps the volume; 3 for none.
     """
-    own, closes = axes < 3, jnp.arange(3) == last
+    dofs, closes = axes < 3, jnp.arange(3) == last
 
     def gradient(d: jax.Array) -> jax.Array:
         stretched = H.at[axes, axes].set(d, mode="drop")
@@ -242,7 +242,7 @@ def equilibrium(
 
     free = closes.at[axes].set(True, mode="drop")
     held = jnp.prod(jnp.where(free, 1.0, 1.0 + jnp.diagonal(H)))
-    start = jnp.where(own, held ** (-1.0 / jnp.maximum(jnp.sum(free), 1)) - 1.0, 0.0)
+    start = jnp.where(dofs, held ** (-1.0 / jnp.maximum(jnp.sum(free), 1)) - 1.0, 0.0)
     if not len(start):
         return gradient(start), jnp.array(True)
     slope_of = jax.jacfwd(gradient)  # (3, 3, u)
@@ -252,19 +252,19 @@ def equilibrium(
         return point.energy(H, tissue) - jnp.vdot(pulls, jnp.diagonal(H))
 
     def linearised(d: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return energy, slope (u,) and stiffness (u, u) in the own stretches."""
+        """Return energy, slope (u,) and stiffness (u, u) in the stretches along ``axes``."""
         H = gradient(d)
         stress, moduli = point.moduli(H, tissue)
         stress = stress - jnp.diag(pulls)
         along, bending = slope_of(d), jax.jacfwd(slope_of)(d)
         stiffness = jnp.einsum("ija,ijkl,klb->ab", along, moduli, along)
         stiffness += jnp.einsum("ij,ijab->ab", stress, bending)
-        stiffness = jnp.where(own[:, None] & own, stiffness, jnp.diag(jnp.where(own, 0.0, 1.0)))
-        slope = jnp.where(own, jnp.einsum("ij,ija->a", stress, along), 0.0)
+        stiffness = jnp.where(dofs[:, None] & dofs, stiffness, jnp.diag(jnp.where(dofs, 0.0, 1.0)))
+        slope = jnp.where(dofs, jnp.einsum("ij,ija->a", stress, along), 0.0)
         return potential(d), slope, stiffness
 
     if len(guesses):  # exponential laws overshoot in strain: begin near a pull's equilibrium
-        along = jnp.where(own, jnp.append(pulls, 0.0)[jnp.minimum(axes, 3)], 0.0)
+        along = jnp.where(dofs, jnp.append(pulls, 0.0)[jnp.minimum(axes, 3)], 0.0)
         along = along / jnp.maximum(jnp.max(jnp.abs(along)), jnp.finfo(along.dtype).tiny)
         tried = start + (1.0 + start) * jnp.asarray(guesses)[:, None] * along
         energies = jax.vmap(potential)(tried)
@@ -272,7 +272,7 @@ def equilibrium(
     end = jax.lax.stop_gradient(minimise_by_newton(linearised, start, low=-1.0))
     # One more step, whose stiffness is a constant, has the derivative of the equilibrium.
     stress = jax.grad(point.energy)(gradient(end.x), tissue) - jnp.diag(pulls)
-    slope = jnp.where(own, jnp.einsum("ij,ija->a", stress, slope_of(end.x)), 0.0)
+    slope = jnp.where(dofs, jnp.einsum("ij,ija->a", stress, slope_of(end.x)), 0.0)
     step = solve_modified(end.hessian, slope)
     converged = end.converged & jnp.all(jnp.isfinite(step))
     return gradient(end.x - jnp.where(converged, step, 0.0)), converged

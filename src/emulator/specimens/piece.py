@@ -1,4 +1,4 @@
-r"""Specimens as they were held: a box of tissue between the grips of a testing machine.
+r"""Gripped specimens: a box of tissue between the grips of a testing machine.
 
 A homogeneous state (:mod:`emulator.specimens.specimen`) is what the middle of a piece would do far
 from its grips. The piece itself is a box, whose faces the machine moves by grip displacements q,
@@ -47,14 +47,14 @@ class Piece:
     specimen : its homogeneous states.
     grips : how it was held.
     faces : the axes whose upper face is moved.
-    moved : the components (i, j): faces normal to j are displaced along i.
-    largest : the largest of each of ``moved`` in any state, without sign.
+    components : the pairs (i, j), each for faces normal to j that are displaced along i.
+    largest : the largest absolute value of each of ``components`` in any state.
     """
 
     specimen: Specimen
     grips: Grips
     faces: tuple[int, ...]
-    moved: tuple[tuple[int, int], ...]
+    components: tuple[tuple[int, int], ...]
     largest: tuple[float, ...]
 
     def __post_init__(self) -> None:
@@ -67,18 +67,18 @@ class Piece:
 
     @property
     def rows(self) -> list[int]:
-        """The axes along which faces move, for each of :attr:`moved`."""
-        return [i for i, _ in self.moved]
+        """The axes along which faces move, for each of :attr:`components`."""
+        return [i for i, _ in self.components]
 
     @property
     def columns(self) -> list[int]:
         """The axes of the faces that move, likewise."""
-        return [j for _, j in self.moved]
+        return [j for _, j in self.components]
 
     @property
     def names(self) -> tuple[str, ...]:
         """The names of the parameters that move faces."""
-        return tuple(f"grip_{AXES[i]}{AXES[j]}" for i, j in self.moved)
+        return tuple(f"grip_{AXES[i]}{AXES[j]}" for i, j in self.components)
 
     @cached_property
     def thin(self) -> int | None:
@@ -151,10 +151,12 @@ class Piece:
             lower = _FACES[j][0] if clamped else _hooks(_FACES[j][0])
             held = AXES if clamped else AXES[j]
             supports.append(Support(lower, components=held))
-            moved = {i: name for (i, k), name in zip(self.moved, self.names, strict=True) if k == j}
-            for i, name in moved.items():
+            amounts = {
+                i: name for (i, k), name in zip(self.components, self.names, strict=True) if k == j
+            }
+            for i, name in amounts.items():
                 supports.append(Support(upper, size[j] * np.eye(3)[i], AXES[i], amount=name))
-            still = "".join(a for i, a in enumerate(AXES) if a in held and i not in moved)
+            still = "".join(a for i, a in enumerate(AXES) if a in held and i not in amounts)
             if still:
                 supports.append(Support(upper, components=still))
         if self.thin is not None:
@@ -178,33 +180,33 @@ class Piece:
 
     def _directions(self) -> dict[str, Any]:
         """Return the fibres and sheets of the specimen, which are the same in all its states."""
-        found = dict[str, Any]()
+        entries = dict[str, Any]()
         rule = self.specimen.fibre_rule
         if self.specimen.angles:
             if rule is None:
                 raise InputError("grips: fibre angles without the rule that made them")
-            found |= {"fibre_rule": rule, "angles": rule.angles_in(self.mesh)}
+            entries |= {"fibre_rule": rule, "angles": rule.angles_in(self.mesh)}
         for name in ("fibres", "sheets"):
-            given = getattr(self.specimen, name)
-            if given is None:
+            directions = getattr(self.specimen, name)
+            if directions is None:
                 continue
-            every = given.reshape(-1, 3)
-            if np.ptp(every, axis=0).max() > _IN_PLANE:
+            vectors = directions.reshape(-1, 3)
+            if np.ptp(vectors, axis=0).max() > _IN_PLANE:
                 raise InputError(
                     f"grips: {name} differ between states; one piece has one direction"
                 )
-            across = 0.0 if self.thin is None else abs(every[0, self.thin])
+            across = 0.0 if self.thin is None else abs(vectors[0, self.thin])
             if min(across, 1.0 - across) > _IN_PLANE:
                 plane = AXES.replace(AXES[self.thin or 0], "")
                 raise InputError(
                     f"grips: {name} are inclined to the {plane} plane of the hooks, which is then "
                     "no plane of symmetry"
                 )
-            found[name] = np.broadcast_to(every[0], (len(self.mesh.elements), 3))
-        return found
+            entries[name] = np.broadcast_to(vectors[0], (len(self.mesh.elements), 3))
+        return entries
 
     def between_marks(self, u: np.ndarray) -> np.ndarray:
-        """Return the components :attr:`moved` (q,) of the gradient between the marks.
+        """Return the gradient between the marks at :attr:`components`, (q,).
 
         u : the displacement (n, 3) mm.
         """
@@ -243,24 +245,24 @@ def pieces(specimen: Specimen) -> dict[str, Piece]:
         A test that moves no face, faces that cannot be clamped at
         once, or directions that the piece cannot have.
     """
-    given, grips = specimen.states, specimen.grips
+    states, grips = specimen.states, specimen.grips
     assert grips is not None
-    faces = {name: _faces(given, rows, grips) for name, rows in given.protocols.items()}
+    faces = {name: _faces(states, rows, grips) for name, rows in states.protocols.items()}
     by_pattern = dict[Any, Piece]()
     for pattern in dict.fromkeys(faces.values()):
-        axes, moved = pattern
-        tests = [rows for name, rows in given.protocols.items() if faces[name] == pattern]
-        H = np.abs(given.gradients[np.concatenate(tests)])
-        largest = tuple(float(H[:, i, j].max()) for i, j in moved)
-        by_pattern[pattern] = Piece(specimen, grips, axes, moved, largest)
+        axes, components = pattern
+        tests = [rows for name, rows in states.protocols.items() if faces[name] == pattern]
+        H = np.abs(states.gradients[np.concatenate(tests)])
+        largest = tuple(float(H[:, i, j].max()) for i, j in components)
+        by_pattern[pattern] = Piece(specimen, grips, axes, components, largest)
     return {name: by_pattern[pattern] for name, pattern in faces.items()}
 
 
 def _faces(
-    given: States, rows: Sequence[int] | np.ndarray, grips: Grips
+    states: States, rows: Sequence[int] | np.ndarray, grips: Grips
 ) -> tuple[tuple[int, ...], tuple[tuple[int, int], ...]]:
     """Return the axes whose faces a test moves, and the components (i, j) of the displacements."""
-    H, free = given.gradients[rows], given.free[rows].any(axis=0)
+    H, free = states.gradients[rows], states.free[rows].any(axis=0)
     moves = np.abs(H).max(axis=0) > _ROUND_OFF
     sheared = [j for j in range(3) if moves[:, j].sum() - moves[j, j] > 0]
     if sheared and grips.held == "hooks":
@@ -272,10 +274,10 @@ def _faces(
         raise InputError("grips: a test moves no face of the piece")
     if len(axes) == 3:
         raise InputError("grips: a test holds the stretches along x, y and z; hooks hold two")
-    moved = tuple(
+    components = tuple(
         (i, j)
         for j in axes
         for i in range(3)
         if (moves[i, j] if i != j else not free[j] and (moves[j, j] or grips.held == "hooks"))
     )
-    return axes, moved
+    return axes, components

@@ -115,12 +115,12 @@ class Specimen(ForwardProblem):
 
     @property
     def node_count(self) -> int:
-        """Three for each state: the corners of its unit cube."""
+        """The number of corners of the unit cubes, three for each state."""
         return 3 * len(self.states.free)
 
     @property
     def mesh(self) -> Mesh:
-        """There is none: :class:`InputError` for what needs one, such as a place or a picture."""
+        """Raise :class:`InputError`: a specimen has no mesh, which places and pictures need."""
         return with_mesh(self).mesh
 
     def gradients(self, u: jax.Array) -> jax.Array:
@@ -166,9 +166,11 @@ def specimen(
     tube : the sector of a tube whose motion ``given`` is, see :mod:`emulator.specimens.tube`.
     entries : the other fields of a :class:`Specimen`.
     """
-    if not isinstance(given, States):
-        given = states_in(given, tube=tube, ordered=ordered)
-    return Specimen(states=given, tube=tube, **{"name": "specimen", **entries})
+    return Specimen(
+        states=given if isinstance(given, States) else states_in(given, tube=tube, ordered=ordered),
+        tube=tube,
+        **{"name": "specimen", **entries},
+    )
 
 
 def require_specimen(problem: ForwardProblem) -> Specimen:
@@ -223,12 +225,12 @@ def read_states(table: Path | Cells, tube: Tube | None = None) -> States:
 
 
 def _likely(words: Sequence[str]) -> str:
-    """Return which names the columns of other conventions may have to get, in words."""
+    """Suggest names for columns that follow other conventions."""
     renamed = []
     for word in words:
         name, unit = with_unit(word)
-        found = _CONVENTION.fullmatch(name)
-        if found is not None:
-            own = "stretch" if found[1] in ("lambda", "λ") else "cauchy"
-            renamed.append(f"{word} {own}_{found[2][0].lower()}{f' [{unit}]' if unit else ''}")
+        match = _CONVENTION.fullmatch(name)
+        if match is not None:
+            quantity = "stretch" if match[1] in ("lambda", "λ") else "cauchy"
+            renamed.append(f"{word} {quantity}_{match[2][0].lower()}{f' [{unit}]' if unit else ''}")
     return f"; call {', '.join(renamed)} if they are that" if renamed else ""

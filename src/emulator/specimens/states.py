@@ -63,18 +63,18 @@ class States(NamedTuple):
 
     @property
     def paths(self) -> np.ndarray:
-        """The way (m,) of each state from the first of its test.
+        """The arc length (m,) of each state from the first of its test.
 
         It is measured in prescribed stretch, plus the pull's way as a share of the test's largest
         pull. Neither depends on measurements.
         """
-        found = np.zeros(len(self.gradients))
+        lengths = np.zeros(len(self.gradients))
         for rows in self.protocols.values():
             steps = np.linalg.norm(np.diff(self.gradients[rows], axis=0), axis=(1, 2))
             largest = np.linalg.norm(self.pulls[rows], axis=1).max() or 1.0
             steps += np.linalg.norm(np.diff(self.pulls[rows], axis=0), axis=1) / largest
-            found[rows[1:]] = np.cumsum(steps)
-        return found
+            lengths[rows[1:]] = np.cumsum(steps)
+        return lengths
 
 
 def motion_columns(words: Collection[str]) -> list[str]:
@@ -93,8 +93,8 @@ def stretch_columns(words: Collection[str]) -> dict[str, str]:
 
 
 def _along_axes(words: Collection[str], measures: Collection[str]) -> dict[str, str]:
-    found = {word: _MOTION.fullmatch(with_unit(word)[0]) for word in words}
-    return {m[2]: word for word, m in found.items() if m is not None and m[1] in measures}
+    matches = {word: _MOTION.fullmatch(with_unit(word)[0]) for word in words}
+    return {m[2]: word for word, m in matches.items() if m is not None and m[1] in measures}
 
 
 def states(
@@ -124,8 +124,8 @@ def states(
     gradients = np.where(free[:, :, None] & diagonal, 0.0, H)
     _check(gradients, free, pulled, held)
     tests = rows_of([""] * count if protocols is None else protocols)
-    for name, own in tests.items() if ordered else ():
-        _check_path(gradients[own], free[own], pulls[own], own, name)
+    for name, rows in tests.items() if ordered else ():
+        _check_path(gradients[rows], free[rows], pulls[rows], rows, name)
     return States(gradients, free, np.nan_to_num(pulls), tests)
 
 
@@ -142,17 +142,17 @@ def components_of(columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.nda
     sources: dict[tuple[int, ...], str] = {}
     for word, values in columns.items():
         name, unit = with_unit(word)
-        found = _MOTION.fullmatch(name)
-        assert found is not None
-        measure, axis, *plane = found.groups()
+        match = _MOTION.fullmatch(name)
+        assert match is not None
+        measure, axis, *plane = match.groups()
         numbers = np.asarray(values, dtype=float)
         if numbers.shape != (count,):
             raise InputError(
                 f"column '{word}' has shape {numbers.shape}, the first one ({count},); give each "
                 "a value a state"
             )
-        own = plane if axis is None else [axis] if measure == APPLIED else [axis, axis]
-        place = tuple(AXES.index(a) for a in own)
+        letters = plane if axis is None else [axis] if measure == APPLIED else [axis, axis]
+        place = tuple(AXES.index(a) for a in letters)
         if place in sources or (axis is None and place[0] == place[1]):
             other = sources.get(place, "a stretch")
             raise InputError(f"column '{word}' says the same as '{other}'; leave one out")
@@ -232,10 +232,10 @@ def _check_path(
     """
     test = f" of '{name}'" if name else ""
     for what, missing in (("pull", np.isnan(pulls)), ("stretch", free)):
-        for axis, own in zip(AXES, missing.T, strict=True):
-            if own.any() and not own.all():
+        for axis, gaps in zip(AXES, missing.T, strict=True):
+            if gaps.any() and not gaps.all():
                 raise InputError(
-                    f"row {rows[np.argmax(own)] + 1}{test} has no {what} along {axis}, others "
+                    f"row {rows[np.argmax(gaps)] + 1}{test} has no {what} along {axis}, others "
                     "have: give it, leave the row out, or name another test in a column 'protocol'"
                 )
     away = np.linalg.norm(H, axis=(1, 2))

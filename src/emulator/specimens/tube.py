@@ -133,8 +133,8 @@ class Tube:
         """
         axial, inner = self._motion(columns)
         tests = rows_of([""] * len(axial) if protocols is None else protocols)
-        for name, own in tests.items() if ordered else ():
-            _check_path(inner[own], axial[own], own, name)
+        for name, rows in tests.items() if ordered else ():
+            _check_path(inner[rows], axial[rows], rows, name)
         R, k = self._rule[0], self.closing
         squares = (R**2 - self.inner_radius**2) / (k * axial[:, None])
         around = k * np.sqrt(inner[:, None] ** 2 + squares) / R
@@ -151,8 +151,8 @@ class Tube:
         H[:, 0, 0], H[:, 1, 1] = around.ravel() - 1.0, np.repeat(axial, self.size) - 1.0
         free = np.broadcast_to([False, False, True], (count, 3))
         points = {
-            name: (own[:, None] * self.size + np.arange(self.size)).ravel()
-            for name, own in tests.items()
+            name: (rows[:, None] * self.size + np.arange(self.size)).ravel()
+            for name, rows in tests.items()
         }
         return States(H, free, np.zeros((count, 3)), points)
 

@@ -1,4 +1,4 @@
-r"""Discrepancy models: Gaussian processes of the principal modes of what a map leaves of FEM.
+r"""Discrepancy models: Gaussian processes of the principal modes of a map's errors against FEM.
 
 .. math:: u(\theta) \approx m(\theta) + \bar e + \sum_k c_k(x)\, \phi_k
 
@@ -109,7 +109,7 @@ class Discrepancy(ArrayPart):
 def fit_discrepancy(
     scene: Scene, runs: Runs, expansion: Expansion, mean_map: Mean | None = None
 ) -> Discrepancy:
-    """Fit a discrepancy model to what ``mean_map`` leaves of FEM ``runs``.
+    """Fit a discrepancy model to the differences of FEM ``runs`` from ``mean_map``.
 
     Parameters
     ----------
@@ -154,9 +154,9 @@ def _check(scene: Scene, runs: Runs, expansion: Expansion) -> None:
             f"the expansion is in {len(expansion.centre)}"
         )
     for what in ("theta", "displacement", "sensitivities"):
-        each = np.isfinite(np.asarray(getattr(runs, what))).reshape(count, -1).all(axis=1)
-        if not each.all():
-            raise InputError(f"FEM run {int(np.argmin(each))}: {what} not finite")
+        finite = np.isfinite(np.asarray(getattr(runs, what))).reshape(count, -1).all(axis=1)
+        if not finite.all():
+            raise InputError(f"FEM run {int(np.argmin(finite))}: {what} not finite")
 
 
 def _remainder(
@@ -199,9 +199,9 @@ def _project(fields: np.ndarray, derivatives: np.ndarray) -> tuple[np.ndarray, j
 
 def _lengths(features: Features, positions: np.ndarray, observations: jax.Array) -> jax.Array:
     """Return inverse lengths (q,) fitted to a subset of the runs and the leading modes."""
-    each = 1 + positions.shape[1]
-    subset = maximin_subset(positions, max(4, _MOST_OBSERVATIONS // each))
-    rows = (subset[:, None] * each + np.arange(each)).ravel()
+    per_run = 1 + positions.shape[1]
+    subset = maximin_subset(positions, max(4, _MOST_OBSERVATIONS // per_run))
+    rows = (subset[:, None] * per_run + np.arange(per_run)).ravel()
     some = Features(features.value[subset], features.derivative[subset])
     return jnp.asarray(fit_lengths(some, observations[rows][:, :_FITTED_MODES]))
 

@@ -30,7 +30,7 @@ from scipy.sparse import csr_array
 
 from emulator.catalogue import scene_from_origin
 from emulator.core.display import TableRepr
-from emulator.core.errors import InputError, look_up
+from emulator.core.errors import InputError, check_known, look_up
 from emulator.core.rooms import offered
 from emulator.core.store import inside, read_arrays, read_json, save_arrays, write_json
 from emulator.fem.reactions import SupportForce
@@ -285,13 +285,20 @@ def shipped() -> list[str]:
     return sorted(path.parent.name for path in SHIPPED.glob("*/emulator.json"))
 
 
-def load(name: str | Path, scene: Scene | None = None) -> Emulator:
+KINDS = ("series", "physics")
+"""Kinds of shipped emulators besides graph networks: Taylor series of FEM with what FEM runs taught
+beside it, and polynomials that no simulation taught."""
+
+
+def load(name: str | Path, scene: Scene | None = None, *, kind: str | None = None) -> Emulator:
     """Return the emulator in folder ``name``, or the shipped one of that name.
 
     Parameters
     ----------
     name : one of :func:`shipped`, else a folder written by :func:`save_emulator`; write ``./name``
-        for a folder called like a shipped one.
+        for a folder called like a shipped one. The graph network of a built-in scene has the
+        scene's name.
+    kind : one of :data:`KINDS`, for another shipped emulator of the scene called ``name``.
     scene : the scene it must match; by default the one it was trained for is made again. A network
         that has learned a family of bodies, and stands alone, is taken to the scene's.
 
@@ -300,6 +307,9 @@ def load(name: str | Path, scene: Scene | None = None) -> Emulator:
     InputError
         Missing or damaged files, or a scene that is not the one it was trained for.
     """
+    if kind is not None:
+        check_known(kind, KINDS, "kind")
+        name = f"{name}_{kind}"
     folder = SHIPPED / str(name) if str(name) in shipped() else Path(name)
     if not (folder / "emulator.json").is_file():
         raise InputError(
@@ -329,9 +339,9 @@ def load(name: str | Path, scene: Scene | None = None) -> Emulator:
     except (KeyError, TypeError) as error:
         raise InputError(f"{file} lacks or garbles {error}") from error
     parts: dict[str, Any] = {}
-    for part, kind in kinds.items():
+    for part, part_kind in kinds.items():
         try:
-            parts[part] = kind.restore(scene, description["parts"][part], inside(arrays, part))
+            parts[part] = part_kind.restore(scene, description["parts"][part], inside(arrays, part))
         except (KeyError, TypeError) as error:
             raise InputError(f"{folder}: its part '{part}' lacks or garbles {error}") from error
         except InputError as error:
@@ -343,7 +353,9 @@ def load(name: str | Path, scene: Scene | None = None) -> Emulator:
 
 def _build(ingredients: Ingredients, _: Options) -> ForwardMap:
     scene = with_mesh(ingredients.scene)
-    return load(ingredients.emulator or scene.name, scene).cache()
+    kind = ingredients.emulator if ingredients.emulator in KINDS else None
+    name = ingredients.emulator if kind is None else None
+    return load(name or scene.name, scene, kind=kind).cache()
 
 
 EMULATOR = ForwardKind(

@@ -115,7 +115,7 @@ class CachedPart:
 
 
 def together(parts: Sequence[CachedPart], count: int) -> CachedPart:
-    """Return the sum of ``parts`` over ``count`` nodes; at most one of them has another field."""
+    """Add ``parts`` over ``count`` nodes; at most one of them may predict a second field."""
     nothing = CachedPart(np.zeros((count, 3)), np.zeros((0, count, 3)), lambda _: jnp.zeros(0))
     terms = [nothing, *parts]
     other = next((part for part in parts if part.decode is not None), nothing)

@@ -53,7 +53,7 @@ def pulled(law: str, stretches: Sequence[float], values: Values | None = None) -
     )
 
 
-def tetrahedra(given: Specimen) -> Scene:
+def tetrahedra(problem: Specimen) -> Scene:
     r"""Return a scene of a specimen's states for finite elements, which are exact of them.
 
     State i is a tetrahedron of nodes 4 i at the origin and 4 i + 1 to 4 i + 3 at :math:`e_x, e_y,
@@ -61,7 +61,7 @@ def tetrahedra(given: Specimen) -> Scene:
     along axis k is a dead force on :math:`e_k`, whose work :math:`V P H_{kk}` in the volume V of
     1/6 mm3 makes it P/6 mN.
     """
-    H, free, pulls, _ = given.states
+    H, free, pulls, _ = problem.states
     count = len(H)
     corners = np.vstack([np.zeros(3), np.eye(3)])
     nodes = (_APART * np.arange(count)[:, None, None] * np.eye(3)[0] + corners).reshape(-1, 3)
@@ -79,15 +79,15 @@ def tetrahedra(given: Specimen) -> Scene:
             along = _VOLUME / MN_PER_N * pulls[loaded, k, None] * np.eye(3)[k]
             forces.append(Force(f"{axis}.pulled", along))
     return Scene(
-        name=given.name,
+        name=problem.name,
         mesh=Mesh(nodes, elements, sets),
-        law=given.law,
-        parameters=given.parameters,
-        constants=given.constants,
+        law=problem.law,
+        parameters=problem.parameters,
+        constants=problem.constants,
         loads=tuple(forces),
         supports=tuple(supports),
-        fibres=given.fibres,
-        sheets=given.sheets,
+        fibres=problem.fibres,
+        sheets=problem.sheets,
     )
 
 

@@ -15,7 +15,7 @@ from emulator.fem import Simulator
 from emulator.surrogates.emulator import Emulator
 
 NAMES = ("once_clamped_beam", "twisting_cube", "liver", "left_ventricle")
-SHIPPED = (*NAMES, *(f"{name}_pignn" for name in NAMES))
+SHIPPED = (*NAMES, *(f"{name}_series" for name in NAMES))
 STEPS_OUT = {"a_tenth": 0.1, "half": 0.5, "twice": 2.0}  # of the box's sides
 FACTOR = 3.0
 ROUND_OFF = 1e-3  # of the largest displacement, in float32

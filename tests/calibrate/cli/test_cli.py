@@ -33,7 +33,7 @@ def test_scenes(capsys):
     assert code == 0
     beam = next(row for row in rows if row["name"] == "once_clamped_beam")
     assert (beam["nodes"], beam["elements"], beam["emulator_shipped"]) == (1025, 480, True)
-    others = ["once_clamped_beam_physics", "once_clamped_beam_pignn"]
+    others = ["once_clamped_beam_physics", "once_clamped_beam_series"]
     assert beam["emulators"] == ["once_clamped_beam", *others]
     assert main(["scenes"]) == 0
     lines = capsys.readouterr().out.splitlines()

@@ -52,7 +52,7 @@ def test_scenes_and_scene_files(ask):
 
 
 def test_emulators_samplers_recipes_and_options(ask):
-    assert ask("evaluate", "liver") == {"liver", "liver_physics", "liver_pignn"}
+    assert ask("evaluate", "liver") == {"liver", "liver_physics", "liver_series"}
     assert ask("infer", "liver", "--sampler", "s") == {"smc"}
     assert ask("train", "--recipe", "m") == {"mechanics"}
     assert ask("infer", "--noise") == {"--noise", "--noise-scale"}

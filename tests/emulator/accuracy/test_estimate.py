@@ -121,7 +121,7 @@ def test_where_one_step_is_wild_the_bar_is_not(beam, one_step, bar, exact, wild,
 def test_a_short_step_far_from_balance_is_not_believed(corner):
     """Two box lengths outside, a network's strains stiffen the beam: each step is a third of what
     is needed, and the next one with the same tangent shorter still."""
-    forward = em.load("once_clamped_beam_pignn").cache()
+    forward = em.load("once_clamped_beam").cache()
     scene, theta = forward.scene, forward.scene.from_unit(jnp.array(corner))
     simulator = em.Simulator(scene)
     error = forward(theta) - simulator(theta)

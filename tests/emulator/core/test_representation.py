@@ -14,7 +14,7 @@ def test_a_scene_and_what_is_made_of_it(beam, simulator):
     assert f"unknowns {(~beam.held).sum()}" in repr(simulator)
     shipped = em.load("once_clamped_beam")
     assert "parts taylor" in repr(shipped)
-    assert "recipe mechanics" in repr(shipped)
+    assert "recipe physics" in repr(shipped)
     for thing in (beam, simulator, shipped):
         table = thing._repr_html_()
         assert table.startswith("<table><caption>")

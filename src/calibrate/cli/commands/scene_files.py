@@ -353,12 +353,12 @@ def completion(arguments: Namespace) -> Answer:
     from calibrate.cli import build_parser
     from emulator.mechanics.laws import LAWS
     from emulator.scenes import BUILT_IN
-    from emulator.surrogates.emulator import shipped
+    from emulator.surrogates.emulator import KINDS, shipped
 
     of_words = {
         "SCENE": _words([*BUILT_IN], "toml"),
         "EMULATOR": _words(shipped()),
-        "NAME|DIR": _words(shipped()),
+        "NAME|DIR": _words([*KINDS, *shipped()]),
         "DIR|fem": _words(["fem"]),
         "synthetic": _words(["synthetic"], "csv"),
     }

@@ -1,4 +1,4 @@
-r"""Tension that a sheet of tissue is under where it lies, as living skin is.
+r"""Tension of a sheet of tissue in its reference state, as in living skin.
 
 A tension :math:`T` in every direction of the plane across the normal n adds the second
 Piola-Kirchhoff stress :math:`S = T\,(I - n \otimes n)` to that of the law. Its energy is
