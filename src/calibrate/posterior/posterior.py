@@ -242,9 +242,8 @@ def sample(
     """
     method = find_sampler(sampler, options)
     model, checked = model.given(data)
-    # Of each datum, the log likelihood and a replicate.
-    kept = len(model.names) + 2 * predictions * sum(np.size(values) for values in checked.values())
-    options = check_options(method, options, kept)
+    kept = len(model.names) + 2 * sum(np.size(values) for values in checked.values())
+    options = check_options(method, options, kept, checkpoint)
     record = provenance(model, seed, method.name, options)
     # The scene's place is no matter. Messages name the first difference, so what a user changes
     # most comes first.
@@ -261,8 +260,7 @@ def sample(
         modes = explore(density, checked, starts, z)
         attributes |= missed_mode(density, checked, z, modes)
     rng_key = jax.random.fold_in(jax.random.key(seed), _PREDICTIONS) if predictions else None
-    draws = named_draws(model, run.z)
-    tree = make_tree(model, checked, draws, run.statistics, rng_key)
+    tree = make_tree(model, checked, named_draws(model, run.z), run.statistics, rng_key)
     tree.attrs.update(as_attributes(record | attributes))
     state.remove()
     return Posterior(tree, model, checked)

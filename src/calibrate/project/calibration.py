@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from contextlib import nullcontext
 from pathlib import Path
-from shutil import disk_usage
 from typing import Any, cast
 
 import numpy as np
@@ -76,8 +75,6 @@ def infer(
         with stages("forward map and model"):
             model, data = build_model(problem, progress=progress)
         sampler, options = problem.run.sampling()
-        if target is not None:
-            _check_space(target, options, len(model.names) + 2 * sum(map(np.size, data.values())))
         with stages("sampling"):
             posterior = sample(
                 model,
@@ -101,22 +98,8 @@ def infer(
         }  # fmt: skip
         posterior.tree.attrs.update(as_attributes(attributes))
         if target is not None:
-            try:
-                save_results(target, problem, posterior)
-            except OSError as error:
-                again = f"{error.strerror}; make room and repeat the run: its seed gives its draws"
-                raise OSError(error.errno, again, error.filename) from error
+            save_results(target, problem, posterior)
     return posterior
-
-
-def _check_space(folder: Path, options: Any, numbers: int) -> None:
-    """Raise InputError where ``folder`` has no room for a run's draws of ``numbers`` each."""
-    size = 8.0 * options.draws * options.chains * numbers
-    if (free := disk_usage(folder).free) < size:
-        raise InputError(
-            f"{folder}: the draws take {size / 1e6:.3g} MB, and the disk has {free / 1e6:.3g} "
-            "free; make room, or name a folder on another disk"
-        )
 
 
 def certify_and_keep(

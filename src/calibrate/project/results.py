@@ -69,7 +69,18 @@ def reserved(folder: Path, results: tuple[str, ...] = _RESULTS, *, force: bool) 
 
 
 def save_results(folder: Path, problem: Problem, posterior: Posterior) -> None:
-    """Write run, data, forward map, errors and posterior in place of earlier results."""
+    """Write run, data, forward map, errors and posterior in place of earlier results.
+
+    Raises OSError, with a word on how to go on, where they cannot be written.
+    """
+    try:
+        _replace_results(folder, problem, posterior)
+    except OSError as error:
+        again = f"{error.strerror}; make room and repeat the run: its seed gives its draws"
+        raise OSError(error.errno, again, error.filename) from error
+
+
+def _replace_results(folder: Path, problem: Problem, posterior: Posterior) -> None:
     assert problem.data is not None, "the posterior has been sampled with data"
     run = asdict(problem.run)
     with TemporaryDirectory(dir=folder, prefix=".new.") as name:

@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping
 from dataclasses import fields
+from pathlib import Path
+from shutil import disk_usage
 from typing import Any
 
 from calibrate.samplers.auto import AUTO, AutoOptions
@@ -58,15 +60,19 @@ def find_sampler(name: str | None, options: Any | None = None) -> Sampler:
     return look_up(SAMPLERS, name, "sampler")
 
 
-def check_options(sampler: Sampler, options: Any | None, numbers: int) -> Any:
+def check_options(
+    sampler: Sampler, options: Any | None, numbers: int, file: str | Path | None = None
+) -> Any:
     """Return ``options``, or the sampler's defaults for ``None``.
 
     numbers : the float64 numbers that are kept of each draw.
+    file : a file on the disk that the draws are written to.
 
     Raises
     ------
     InputError
-        The options are those of another sampler, or ask for more draws than memory has room for.
+        The options are those of another sampler, or ask for more draws than memory, or the disk,
+        has room for.
     """
     options = sampler.options() if options is None else options
     if type(options) is not sampler.options:
@@ -81,6 +87,13 @@ def check_options(sampler: Sampler, options: Any | None, numbers: int) -> Any:
             f"{options.chains} x {options.draws} draws take {size / 1e9:.3g} GB, and there are "
             f"{memory() / 1e9:.3g}; give fewer than {most:.2g} draws"
         )
+    if file is not None:
+        folder = next(path for path in Path(file).absolute().parents if path.exists())
+        if (free := disk_usage(folder).free) < size:
+            raise InputError(
+                f"{folder}: the draws take {size / 1e6:.3g} MB, and the disk has "
+                f"{free / 1e6:.3g} free; make room, or name a folder on another disk"
+            )
     return options
 
 

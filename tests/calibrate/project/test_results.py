@@ -154,7 +154,7 @@ def test_a_result_is_replaced_at_once_or_not_at_all(infer_once, folder, monkeypa
 
 
 def test_a_full_disk_is_told_before_the_draws_are_made(tmp_path, monkeypatch):
-    monkeypatch.setattr("calibrate.project.calibration.disk_usage", lambda _: Mock(free=1000))
+    monkeypatch.setattr("calibrate.samplers.disk_usage", lambda _: Mock(free=1000))
     with pytest.raises(InputError, match=r"the draws take 0.0166 MB, and the disk has 0.001 free"):
         infer(RUN, tmp_path / "r")
     assert not (tmp_path / "r").exists()
