@@ -46,12 +46,12 @@ SEEN = 0.32
 NOISE = cal.CorrelatedNoise(length=LENGTH, sd_scale=0.2, spatial_sd_scale=0.4)  # kPa
 
 
-def scene_of(given: States) -> em.Scene:
+def scene_of(states_of_tests: States):
     """The specimen: fibres along x, sheets along y."""
     law = em.find_law(LAW)
     units = {quantity.name: quantity.unit for quantity in law.quantities}
     return em.specimen(
-        given, name="myocardium", law=law,
+        states_of_tests, name="myocardium", law=law,
         parameters=tuple(em.Parameter(n, units[n], *r, "log") for n, r in RANGES.items()),
         constants={"kappa": KAPPA}, fibres=[1.0, 0.0, 0.0], sheets=[0.0, 1.0, 0.0],
     )  # fmt: skip

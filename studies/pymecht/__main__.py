@@ -97,7 +97,7 @@ def theirs(pymecht: ModuleType, law: str, measure: str) -> Any:
         return pymecht.PlanarBiaxialExtension(material, force_measure=measure)
 
 
-def ours(law: str, varied: tuple[str, ...]) -> em.Scene:
+def ours(law: str, varied: tuple[str, ...]):
     """The specimen of a law; what does not vary is constant."""
     values = LAWS[law][0] | {"kappa": KAPPA}
     description, given = em.find_law(law), stretches()
