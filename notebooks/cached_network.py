@@ -94,7 +94,7 @@ print("volumes", np.round(data, 1), "mL")
 def ventricle(data):
     """Volumes (3,) in mL at the known pressures."""
     a = numpyro.sample("a", dist.LogUniform(0.2, 0.52))
-    ratio = numpyro.sample("a_f/a", dist.LogNormal(jnp.log(15.0), 0.4))
+    ratio = numpyro.sample("ratio", dist.LogNormal(jnp.log(15.0), 0.4))
     material = {"a": a, "b": 2.2, "a_f": ratio * a, "b_f": 2.4}
 
     def predicted(pressure):
@@ -164,7 +164,7 @@ assert total["pressure"] + total["a_f"] > 0.8
 rows = np.random.default_rng(0).integers(500, size=3)
 for row in rows:
     one = {name: float(draws[name][0, row]) for name in draws}
-    theta = scene.theta(a=one["a"], b=2.2, a_f=one["a_f/a"] * one["a"], b_f=2.4, pressure=1.0)
+    theta = scene.theta(a=one["a"], b=2.2, a_f=one["ratio"] * one["a"], b_f=2.4, pressure=1.0)
     by_fem = float(volume.evaluate(simulator(theta)[volume.nodes], theta))
     by_network = float(volume_at(theta))
     print(f"FEM {by_fem:8.3f} mL   network {by_network:8.3f} mL")
