@@ -187,7 +187,7 @@ def specimen() -> Journey:
 
 
 JOURNEYS: dict[str, tuple[int, Callable[[], Journey]]] = {
-    "scene TOML to Scene": (17, scene_file),
+    "scene TOML to Scene": (18, scene_file),
     "Simulator.solve to law.energy": (12, solve),
     "calibrate infer to the data file": (32, parse),
     "calibrate infer to the likelihood": (80, likelihood),
