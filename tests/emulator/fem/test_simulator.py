@@ -58,6 +58,7 @@ def test_the_solution_minimises_the_energy(beam, simulator):
         assert Pi(u + v, beam.centre) > Pi(u, beam.centre)
 
 
+@pytest.mark.optimised
 def test_tangent_is_the_derivative_of_the_residual(simulator, beam):
     system = simulator.system
     rng = np.random.default_rng(1)
@@ -89,6 +90,7 @@ def test_gradient_in_theta_against_central_differences(beam, simulator):
     np.testing.assert_allclose(forward, reverse, rtol=1e-10)
 
 
+@pytest.mark.optimised
 def test_taylor_remainder_in_theta(beam, simulator):
     theta, direction = beam.theta(mu=63.0, lam=70.0), jnp.array([1.0, -0.7])
     u, slope_u = jax.jvp(lambda t: simulator.solve(t).displacement, (theta,), (direction,))
@@ -140,6 +142,7 @@ def test_prescribed_displacements_are_met_exactly(cube):
     )
 
 
+@pytest.mark.optimised
 def test_a_heavy_load_is_taken_in_steps():
     scene = em.scenes.twisting_cube(cells=4, degrees=170.0, order=1)
     one = em.Simulator(scene, em.NewtonOptions(level_iterations=7))
