@@ -85,6 +85,7 @@ from calibrate.statistical_model import Model
 from calibrate.statistical_model.density import Heights, without_nan
 from calibrate.statistical_model.errors import errors_of_data
 from emulator.core.errors import InputError
+from emulator.core.kept import kept
 
 _DRAWS = 32  # draws of a posterior over which a gain is averaged
 _DATA_SETS = 64
@@ -190,7 +191,7 @@ def expected_precision(
 
 
 class _DataPrograms:
-    """What a model predicts at unknowns x (q,), each function compiled once for all data sets."""
+    """The compiled functions of a model's unknowns x (q,) that all data sets share."""
 
     def __init__(self, model: Model) -> None:
         self.model = model
@@ -239,11 +240,17 @@ class _DataPrograms:
         return data, self._information(x, error, sizes), slope
 
 
+@kept
+def _data_programs(model: Model) -> _DataPrograms:
+    """Return the compiled functions of a model, which the model keeps."""
+    return _DataPrograms(model)
+
+
 def _posterior_covariances(
     model: Model, errors: Errors, prior: np.ndarray, before: np.ndarray, count: int, seed: int
 ) -> np.ndarray:
     """Return posterior covariances (r, q, q) given data made at draws of the prior's x (s, q)."""
-    programs, shared = _DataPrograms(model), prior[count:][:_FROM_PRIOR]
+    programs, shared = _data_programs(model), prior[count:][:_FROM_PRIOR]
     means, valid = programs.answers(prior[:count])
     rows = _some(valid)
     truths, means = prior[rows], {name: mean[rows] for name, mean in means.items()}

@@ -60,7 +60,7 @@ class HeldOut:
 
     @property
     def missed(self) -> bool:
-        """Whether the others do not predict the test: too few of its points are inside the band."""
+        """True if too few points of the test are inside the band that the other tests predict."""
         chance = bdtr(round(self.inside * self.points), self.points, 1.0 - 2.0 * _TAIL)
         return self.inside < _MISSED and bool(chance < _CHANCE)
 

@@ -136,7 +136,7 @@ def _closest(X: jax.Array, point: jax.Array, corners: int) -> tuple[jax.Array, j
         def quadratic(s: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
             return *jax.value_and_grad(function)(s), jax.hessian(function)(s)
 
-        # From the middle: along a coordinate that is 0 the slope is 0, and the search would stay.
+        # The search starts in the middle: where a coordinate is 0 its slope is 0, and it stays 0.
         middle = jnp.full(corners, corners**-0.5)
         s = minimise_by_newton(quadratic, middle, tolerance=_TOLERANCE).x
         return barycentric(s), size * jnp.linalg.norm(gap(s))

@@ -1,13 +1,13 @@
-r"""Which errors of data can be together, and how their terms become one likelihood.
+r"""The algebra of errors of data: their terms are joined to one likelihood, or refused.
 
-Terms are joined to two (:mod:`calibrate.model_error.marginal`), the second eliminated beside the
-information that the first leaves. The first are those of size 1 without shares of the prediction,
-which leave the same for all unknowns. If the others have no shares, all their modes have one size;
-in both, modes are then chosen for which G is diagonal. If one has shares, the second is eliminated
-anew for each prediction.
+All terms are joined to two (:mod:`calibrate.model_error.marginal`), and the second is eliminated
+beside the information that the first leaves. The first term has the modes of size 1 without shares
+of the prediction, so that it leaves the same information for all unknowns. The second term has the
+other modes, of one size. Modes are chosen for which G is diagonal, except where the second term has
+shares: it is then eliminated anew for each prediction.
 
-What cannot be together follows from that: noise beside which terms are integrated out has to be
-Gaussian, of an information that does not change with the unknowns, and one size can be unknown.
+Three conditions follow. Noise must be Gaussian where terms are integrated out, its information must
+not change with the unknowns, and at most one size may be unknown.
 """
 
 from __future__ import annotations

@@ -55,7 +55,7 @@ Means = Mapping[str, jax.Array]
 """Data without noise by the observation's name."""
 
 LEARNED = "the size of the forward map's error is learned"
-"""What is said of a size that is a function of the unknowns."""
+"""The words of an error message for a size that is a function of the unknowns."""
 
 _SIZED, _VARYING = "sized_", "varying_"  # prefixes of the arrays of a second term
 _DIAGONAL = ("weights", "strength", "modes", "mixing")  # arrays of a term that is diagonal, and
@@ -127,12 +127,12 @@ class Term:
 
     @property
     def is_learned(self) -> bool:
-        """Whether the errors are the forward map's, learned from FEM runs."""
+        """True for errors of the forward map, which are learned from FEM runs."""
         return isinstance(self.size, Amplitude)
 
     @property
     def unknown_size(self) -> str:
-        """What is said of the size if it is not known; empty for 1."""
+        """The words of an error message for a size that is not known; empty for a size of 1."""
         if isinstance(self.size, Scale):
             return f"the size '{self.size.name}' is inferred (scale {self.size.prior_scale:g})"
         return LEARNED if self.is_learned else ""
@@ -197,7 +197,7 @@ class ModelError:
 
     @property
     def is_learned(self) -> bool:
-        """Whether errors of the forward map, learned from FEM runs, are among them."""
+        """True if one of the terms is of the forward map, learned from FEM runs."""
         return isinstance(self.size, Amplitude)
 
     @property
