@@ -202,6 +202,7 @@ class Evidence:
     mesh : the changes by a finer mesh.
     box : the ends of ranges that end the posterior in place of the data.
     noise : the noises that are inferred.
+    forward : the kind of the forward map.
     """
 
     draws: Changes
@@ -216,3 +217,4 @@ class Evidence:
     mesh: MeshChange = MeshChange(why="not asked")
     box: tuple[BoxEnd, ...] = ()
     noise: tuple[TakenUp, ...] = ()
+    forward: str = ""

@@ -163,15 +163,16 @@ class Hierarchy(TableRepr):
 
     def box_ends(self) -> list[BoxEnd]:
         """Return the ends of ranges that end members' posteriors in place of the data."""
-        box = {}
+        box, limits = {}, {}
         for name in self.shared:
             about = self.tree["posterior"][name].attrs
             if "box" in about:
-                low, high = map(float, about["box"])
+                low, high, *ends = map(float, about["box"])
+                limits[name] = (ends[0], ends[1]) if ends else (-np.inf, np.inf)
                 box[name] = Parameter(name, about["units"], low, high, about["scale"])
         ends = []
         for member in self.members:
-            member_ends = box_ends(self.member(member), box)
+            member_ends = box_ends(self.member(member), box, limits)
             ends += [replace(end, name=f"{end.name}[{member}]") for end in member_ends]
         return sorted(ends, key=lambda end: -end.shift)
 
@@ -229,7 +230,9 @@ def make_tree(
         for group in ("posterior", NEW):
             tree[group][name].attrs.update(units=parameter.unit or "1", scale=parameter.scale)
         if all(name in member.boxed for member in model.members.values()):
-            tree["posterior"][name].attrs["box"] = [parameter.low, parameter.high]
+            limits = next(iter(model.members.values())).forward.scene.quantities[name]
+            box = [parameter.low, parameter.high, limits.low, limits.high]
+            tree["posterior"][name].attrs["box"] = box
     return tree
 
 

@@ -72,20 +72,27 @@ class BoxEnd:
 
 
 @one_blas_thread()
-def box_ends(draws: Mapping[str, np.ndarray], box: Mapping[str, Parameter]) -> list[BoxEnd]:
+def box_ends(
+    draws: Mapping[str, np.ndarray],
+    box: Mapping[str, Parameter],
+    limits: Mapping[str, tuple[float, float]] = {},
+) -> list[BoxEnd]:
     """Return the ends of ranges that end the posterior in place of the data, the worst first.
 
     Parameters
     ----------
     draws : the draws (s,) of each unknown. box : the range of each unknown whose prior is a box.
+    limits : the least and the largest value of a parameter by nature, by its name.
     """
     names = [n for n in box if np.ptp(draws[n]) > 0.0]
     if not names:
         return []
     x = np.stack([box[n].to_unit(jnp.ravel(draws[n])) for n in names], axis=1)
     x = np.clip(x, 0.0, 1.0)
-    ranges = np.array([(box[n].wider().low, box[n].wider().high) for n in names])
-    wide = np.stack([box[n].to_unit(jnp.asarray(r)) for n, r in zip(names, ranges, strict=True)])
+    ranges = [box[n].wider(*limits.get(box[n].name, ())) for n in names]
+    wide = np.stack(
+        [box[n].to_unit(jnp.array([r.low, r.high])) for n, r in zip(names, ranges, strict=True)]
+    )
     wider = np.abs(wide - [0.0, 1.0]).T
     covariance = np.atleast_2d(np.cov(x, rowvar=False))
     directions = np.vstack([np.eye(len(names)), np.linalg.eigh(covariance)[1].T])

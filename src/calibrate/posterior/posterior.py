@@ -145,7 +145,9 @@ class Posterior(TableRepr):
 
     def box_ends(self) -> list[BoxEnd]:
         """Return the ends of ranges that end the posterior in place of the data, worst first."""
-        return box_ends(self.draws(), self.model.box)
+        quantities = self.model.forward.scene.quantities
+        limits = {name: (q.low, q.high) for name, q in quantities.items()}
+        return box_ends(self.draws(), self.model.box, limits)
 
     def save(self, path: str | Path) -> None:
         """Write the DataTree as netCDF, whole or not at all."""

@@ -105,7 +105,8 @@ def _is_made_by(rule: FibreRule, scene: Scene) -> bool:
 
 def wider[P: ForwardProblem](scene: P) -> P:
     """Return ``scene`` with every parameter's range wider by half of it on each side."""
-    parameters = tuple(parameter.wider() for parameter in scene.parameters)
+    limits = {name: (q.low, q.high) for name, q in scene.quantities.items()}
+    parameters = tuple(parameter.wider(*limits[parameter.name]) for parameter in scene.parameters)
     origin = {"scene": WIDER, "of": dict(scene.origin)} if scene.origin else {}
     return cast(P, replace(cast(Any, scene), parameters=parameters, origin=origin))
 
