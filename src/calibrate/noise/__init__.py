@@ -49,13 +49,15 @@ def parse_noise(text: str) -> float | dict[str, Any]:
         try:
             return float(text)
         except ValueError as error:
-            usage = ", ".join(kind.usage for kind in NOISES.values())
+            usage = "; ".join(kind.usage() for kind in NOISES.values())
             raise InputError(f"'{text}' is neither a number nor a noise; give {usage}") from error
     description: dict[str, Any] = {"kind": kind}
     for option in options.split(",") if options else ():
         name, equals, value = option.partition("=")
         if not equals:
-            raise InputError(f"'{text}': '{option}' is not option=value; give {NOISES[kind].usage}")
+            raise InputError(
+                f"'{text}': '{option}' is not option=value; give {NOISES[kind].usage()}"
+            )
         description[name] = _number(value)
     noise_of(description)  # refuses options that the kind does not take
     return description
