@@ -161,6 +161,10 @@ class ParameterSpace:
         self.check(theta, owner)
         return theta
 
+    def by_name(self, theta: Any) -> dict[str, float]:
+        """Return the entries of a theta (p,) by name."""
+        return dict(zip(self.names, map(float, theta), strict=True))
+
     def check(self, theta: jax.Array, owner: str) -> None:
         """Raise :class:`InputError` unless every row of ``theta`` (..., p) is inside the box."""
         rows = np.atleast_2d(np.asarray(theta))

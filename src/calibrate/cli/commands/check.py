@@ -170,7 +170,7 @@ def _mesh(arguments: Namespace) -> Answer:
     length = np.linalg.norm(error.coarse, axis=1)
     result: dict[str, Any] = {
         "scene": scene.name,
-        "theta": words.theta_by_name(scene, theta),
+        "theta": scene.space.by_name(theta),
         "nodes": len(scene.mesh.nodes),
         "quality": quality._asdict(),
         "finer_nodes": len(error_of_mesh.finer.scene.mesh.nodes),
