@@ -26,6 +26,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -43,6 +44,9 @@ from calibrate.measurements.outputs import FIELD, Outputs
 from calibrate.priors import Prior, bisect, bounds, box_prior, dependence_of
 from calibrate.statistical_model.prior_range import fit_to
 from emulator.core.errors import InputError, check_known, check_seed
+from emulator.core.store import write_netcdf
+from emulator.geometry.io import write_vtu
+from emulator.scenes.scene import Scene
 from emulator.surrogates.protocol import ForwardMap
 
 _EDGE = 1e-9  # cut off the unit interval, because unbounded priors have infinite quantiles at 0
@@ -139,6 +143,7 @@ CONFIDENCE = 0.95
 _DEVIATIONS = norm.ppf(0.5 * (1.0 + CONFIDENCE))  # half-width of the interval of a normal, in sd
 _RESAMPLES = 100
 _LEVELS = 4  # levels of Morris' grid
+_FEW = 100  # numbers of an observation whose indices are told one by one
 
 
 def analyse(
@@ -366,3 +371,37 @@ def sensitivity(
             datasets[name] = datasets[name].assign_coords(output=outputs.nodes)
     about = {"forward": forward.label, "scene": scene.name, "method": method, "seed": seed}
     return xr.DataTree.from_dict({"/": xr.Dataset(attrs=about), **datasets})
+
+
+def indices_to_json(indices: xr.DataTree) -> dict[str, Any]:
+    """Return the indices of all numbers together, and of each where they are few, as plain JSON."""
+    result = {str(name): value for name, value in indices.attrs.items()}
+    for node, child in indices.children.items():
+        data = child.to_dataset()
+        few = data.sizes["output"] <= _FEW
+        result[node] = {name: data.attrs[name] for name in ("unit", "evaluations")} | {
+            str(name): values.values.tolist()
+            for name, values in data.variables.items()
+            if few or "output" not in values.dims
+        }
+    return result
+
+
+def write_indices(indices: xr.DataTree, scene: Scene, folder: str | Path) -> None:
+    """Write the indices as netCDF, their figures, and indices of the nodes as VTU."""
+    from calibrate.figures.sensitivity import draw  # a room
+
+    folder = Path(folder)
+    write_netcdf(folder / "sensitivity.nc", indices)
+    draw(indices, scene, folder)
+    if FIELD in indices.children:
+        data = indices[FIELD].to_dataset()
+        nodal = {
+            f"{name} {label}": np.nan_to_num(values)
+            for name in ("first", "total", "mu_star", "bound_on_total")
+            if name in data
+            for label, values in zip(
+                data[data[name].dims[0]].values, data[name].values, strict=True
+            )
+        }
+        write_vtu(folder / "sensitivity.vtu", scene.mesh, point_data=nodal)
