@@ -26,7 +26,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -44,9 +43,6 @@ from calibrate.measurements.outputs import FIELD, Outputs
 from calibrate.priors import Prior, bisect, bounds, box_prior, dependence_of
 from calibrate.statistical_model.prior_range import fit_to
 from emulator.core.errors import InputError, check_known, check_seed
-from emulator.core.store import write_netcdf
-from emulator.geometry.io import write_vtu
-from emulator.scenes.scene import Scene
 from emulator.surrogates.protocol import ForwardMap
 
 _EDGE = 1e-9  # cut off the unit interval, because unbounded priors have infinite quantiles at 0
@@ -385,23 +381,3 @@ def indices_to_json(indices: xr.DataTree) -> dict[str, Any]:
             if few or "output" not in values.dims
         }
     return result
-
-
-def write_indices(indices: xr.DataTree, scene: Scene, folder: str | Path) -> None:
-    """Write the indices as netCDF, their figures, and indices of the nodes as VTU."""
-    from calibrate.figures.sensitivity import draw  # a room
-
-    folder = Path(folder)
-    write_netcdf(folder / "sensitivity.nc", indices)
-    draw(indices, scene, folder)
-    if FIELD in indices.children:
-        data = indices[FIELD].to_dataset()
-        nodal = {
-            f"{name} {label}": np.nan_to_num(values)
-            for name in ("first", "total", "mu_star", "bound_on_total")
-            if name in data
-            for label, values in zip(
-                data[data[name].dims[0]].values, data[name].values, strict=True
-            )
-        }
-        write_vtu(folder / "sensitivity.vtu", scene.mesh, point_data=nodal)

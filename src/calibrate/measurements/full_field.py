@@ -276,14 +276,14 @@ def measured_field(
     (parameter, path, column), field = amount, read_full_field(*files)
     amounts = read_amounts(path, column)
     sign = sign_of(scene, parameter, amounts)
-    amounts = {frame: sign * pull for frame, pull in amounts.items()}
+    amounts = {frame: sign * value for frame, value in amounts.items()}
     pulled = [frame for frame in field.frames if amounts.get(frame) != 0.0]
     chosen = spread_points(field.points, min(points, len(field.points)))
     field = field.only(frames or pulled, chosen)
     observe, data = field_data(scene, field, amounts)
     parts = dict(observe.parts)
-    for word, path, *columns in forces:
-        at, force = read_curve(path, *columns, like=list(amounts.values()))
+    for word, path, pull, force in forces:
+        at, forces_at = read_curve(path, pull, force, list(amounts.values()))
         ((name, part),) = parse_observation(scene, word, 0).parts.items()
         if in_state(name, field.frames[0]) in parts:
             raise InputError(f"force: {word} is given twice; give one curve for each")
@@ -294,7 +294,7 @@ def measured_field(
                     f"{amounts[frame]:.4g}"
                 )
             parts[in_state(name, frame)] = part
-            data[in_state(name, frame)] = np.array(np.interp(amounts[frame], at, force))
+            data[in_state(name, frame)] = np.array(np.interp(amounts[frame], at, forces_at))
     known = {in_state(parameter, frame): amounts[frame] for frame in field.frames}
     return observations(parts), data, known
 

@@ -167,8 +167,8 @@ class Hierarchy(TableRepr):
         for name in self.shared:
             about = self.tree["posterior"][name].attrs
             if "box" in about:
-                low, high, *ends = map(float, about["box"])
-                limits[name] = (ends[0], ends[1]) if ends else (-np.inf, np.inf)
+                low, high, *nature = map(float, about["box"])
+                limits[name] = (nature[0], nature[1]) if nature else (-np.inf, np.inf)
                 box[name] = Parameter(name, about["units"], low, high, about["scale"])
         ends = []
         for member in self.members:

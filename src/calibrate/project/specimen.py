@@ -117,8 +117,8 @@ def _notes(
 ) -> list[str]:
     """Return one sentence per value that was read or guessed; ``of_law`` is the one on the law."""
     part, _ = next(iter(measured.values()))
-    names = ("stretch_around", "stretch_axial") if tube else [f"stretch_{a}" for a in AXES]
-    motions = zip(names, part.stretches.T, strict=False)
+    axes = ["stretch_around", "stretch_axial"] if tube else [f"stretch_{a}" for a in AXES]
+    motions = zip(axes, part.stretches.T, strict=False)
     notes = [
         f"{len(part.states.free)} states in {_tests(part.states)}",
         *(f"{n} from {x.min():.4g} to {x.max():.4g}" for n, x in motions if np.ptp(x) > 0.0),

@@ -99,7 +99,7 @@ def test_slow_iterations_are_shown_and_kept_one_by_one(problem, monkeypatch, tmp
     written = kill_after(monkeypatch, None)
     for name, value in (("chains._SHOWN", 0.0), ("chains._MANY_STEPS", 0)):
         monkeypatch.setattr(f"calibrate.samplers.{name}", value)
-    monkeypatch.setattr("emulator.core.display.EVERY", 0.0)
+    monkeypatch.setattr("emulator.core.display.EVERY", 1e-3)
     slow = run(problem, "nuts", checkpoint=tmp_path / "sampling.safetensors", progress=True)
     assert len(written) == 2 * (60 + 120)  # of a pilot and of the final run
     assert "gradients an iteration" in capsys.readouterr().err

@@ -269,7 +269,7 @@ _COLUMNS = {
 )
 def sensitivity(arguments: Namespace) -> Answer:
     """Analyse a scene's forward map, and write the indices."""
-    from calibrate.analysis.sensitivity import indices_to_json, sensitivity, write_indices
+    from calibrate.analysis.sensitivity import indices_to_json, sensitivity
     from calibrate.measurements import parse_observation
     from calibrate.priors import prior_of
     from calibrate.project.run import with_absolute_paths
@@ -298,7 +298,9 @@ def sensitivity(arguments: Namespace) -> Answer:
         seed=arguments.seed,
     )
     if arguments.out:
-        write_indices(indices, scene, arguments.out)
+        from calibrate.figures.sensitivity import write
+
+        write(indices, scene, arguments.out)
     return Answer(indices_to_json(indices), _indices_in_words(indices))
 
 
