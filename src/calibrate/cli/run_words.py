@@ -64,6 +64,7 @@ def _add_run(parser: ArgumentParser, more: Sequence[str]) -> None:
     from calibrate.measurements import OBSERVATIONS
     from calibrate.measurements.words import usage_of
     from calibrate.noise import NOISES
+    from calibrate.noise import usage_of as usage_of_noise
     from calibrate.project.run import Run
     from emulator.core.schema import documented
 
@@ -84,7 +85,7 @@ def _add_run(parser: ArgumentParser, more: Sequence[str]) -> None:
                     observations="; ".join(
                         usage_of(kind).partition(";")[0] for kind in OBSERVATIONS.values()
                     ),
-                    noises="; ".join(kind.usage() for kind in NOISES.values()),
+                    noises="; ".join(map(usage_of_noise, NOISES.values())),
                 )
             about: dict[str, Any] = {"metavar": word.metavar}
             if hints[name] is bool:

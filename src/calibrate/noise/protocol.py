@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from numbers import Real
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, Self
@@ -99,12 +99,6 @@ class Noise(ABC):
 
     def __post_init__(self) -> None:
         self.scales  # noqa: B018 - scales that cannot be are refused here
-
-    @classmethod
-    def usage(cls) -> str:
-        """Return its word and its options on the command line, for help and errors."""
-        options = (f.name for f in fields(cls) if f.name != "sites")  # type: ignore[arg-type]
-        return f"{cls.kind}:OPTION=VALUE,... of {', '.join(options)}"
 
     @property
     @abstractmethod

@@ -23,6 +23,7 @@ from calibrate.statistical_model import Model
 from emulator.core.display import TableRepr
 from emulator.core.errors import InputError, look_up
 from emulator.core.store import write_netcdf
+from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.parameter_space import Parameter
 
 ALONE, NEW, CORRELATION = "alone", "new_member", "correlation"
@@ -163,12 +164,13 @@ class Hierarchy(TableRepr):
 
     def box_ends(self) -> list[BoxEnd]:
         """Return the ends of ranges that end members' posteriors in place of the data."""
-        box, limits = {}, {}
+        box, limits = {}, dict[str, Quantity]()
         for name in self.shared:
             about = self.tree["posterior"][name].attrs
             if "box" in about:
                 low, high, *nature = map(float, about["box"])
-                limits[name] = (nature[0], nature[1]) if nature else (-np.inf, np.inf)
+                if nature:
+                    limits[name] = Quantity(name, low=nature[0], high=nature[1])
                 box[name] = Parameter(name, about["units"], low, high, about["scale"])
         ends = []
         for member in self.members:

@@ -22,13 +22,18 @@ from emulator.scenes.forward_problem import ForwardProblem
 from emulator.scenes.scene import Scene, cavity_sets
 
 
+def by_name(problem: ForwardProblem, theta: Any) -> dict[str, float]:
+    """Return the entries of a theta (p,) by their parameters' names."""
+    return dict(zip(problem.parameter_names, map(float, theta), strict=True))
+
+
 def described(
     problem: ForwardProblem, theta: jax.Array, solution: Solution | Unloaded
 ) -> dict[str, Any]:
     """Return scene, theta (p,), and how the solve ended."""
     return {
         "scene": problem.name,
-        "theta": problem.space.by_name(theta),
+        "theta": by_name(problem, theta),
         "status": Status(int(solution.status)).name.lower(),
         "iterations": int(solution.iterations),
         "residual": float(solution.residual),

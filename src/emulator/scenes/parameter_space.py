@@ -23,9 +23,6 @@ import numpy as np
 
 from emulator.core.errors import InputError
 
-_AT_LIMIT = 0.02  # share of a range within which its end is at a limit of nature
-_SHORT_OF = 0.999  # share of the way to a limit, which is excluded, that a wider range may go
-
 
 @dataclass(frozen=True)
 class Parameter:
@@ -72,26 +69,17 @@ class Parameter:
         span = self.high - self.low
         return value * math.log(self.high / self.low) if self.scale == "log" else 0.0 * value + span
 
-    def wider(self, least: float = -math.inf, most: float = math.inf) -> Parameter:
+    def wider(self) -> Parameter:
         """Return the parameter with a range wider by half on each side, on its scale.
 
-        A range above or from zero never reaches beyond zero, and none beyond ``least`` and
-        ``most``, the limits of its values by nature. An end near such a limit stays.
+        A range above or from zero never reaches beyond zero.
         """
         if self.scale == "log":
             factor = math.sqrt(self.high / self.low)
-            low, high = self.low / factor, self.high * factor
-        else:
-            half = 0.5 * (self.high - self.low)
-            low, high = self.low - half, self.high + half
-            if self.low >= 0.0:
-                low = max(low, 0.001 * self.low)
-            if self.low - least < _AT_LIMIT * (self.high - self.low):
-                low = self.low
-        low = max(low, self.low - _SHORT_OF * (self.low - least))
-        if most - self.high < _AT_LIMIT * (self.high - self.low):
-            high = self.high
-        return replace(self, low=low, high=min(high, self.high + _SHORT_OF * (most - self.high)))
+            return replace(self, low=self.low / factor, high=self.high * factor)
+        half = 0.5 * (self.high - self.low)
+        least = 0.001 * self.low if self.low >= 0.0 else -math.inf
+        return replace(self, low=max(self.low - half, least), high=self.high + half)
 
     def to_json(self) -> dict[str, Any]:
         """Return the arguments of the constructor as plain JSON."""
@@ -160,10 +148,6 @@ class ParameterSpace:
         theta = jnp.array([float(values[name]) for name in self.names])
         self.check(theta, owner)
         return theta
-
-    def by_name(self, theta: Any) -> dict[str, float]:
-        """Return the entries of a theta (p,) by name."""
-        return dict(zip(self.names, map(float, theta), strict=True))
 
     def check(self, theta: jax.Array, owner: str) -> None:
         """Raise :class:`InputError` unless every row of ``theta`` (..., p) is inside the box."""

@@ -14,7 +14,7 @@ from calibrate.measurements import (
     spread_landmarks,
     spread_nodes,
 )
-from calibrate.noise import NOISES
+from calibrate.noise import NOISES, usage_of
 from emulator.core.errors import InputError
 
 NO_THETA = jnp.zeros(0)
@@ -191,5 +191,5 @@ def test_the_guide_names_every_kind():
     for kind in (*OBSERVATIONS.values(), *NOISES.values()):
         assert f"`{kind.kind}" in text, kind.kind
     for kind in NOISES.values():
-        for option in kind.usage().partition(" of ")[2].split(", "):
+        for option in usage_of(kind).partition(" of ")[2].split(", "):
             assert f"`{option}`" in text, option

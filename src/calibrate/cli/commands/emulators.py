@@ -39,7 +39,7 @@ def predict(arguments: Namespace) -> Answer:
     import numpy as np
 
     from emulator.accuracy.estimate import guard
-    from emulator.fem.outcome import cavity_volumes, write_outcome
+    from emulator.fem.outcome import by_name, cavity_volumes, write_outcome
     from emulator.surrogates import load
 
     if arguments.out:
@@ -61,7 +61,7 @@ def predict(arguments: Namespace) -> Answer:
     result: dict[str, Any] = {
         "emulator": arguments.emulator,
         "scene": scene.name,
-        "theta": scene.space.by_name(theta),
+        "theta": by_name(scene, theta),
         "trusted": bool(against.trusted),
         "guard": against.sentence(scene),
         "max_displacement": float(np.linalg.norm(u, axis=1).max()) if finite else None,
