@@ -51,7 +51,7 @@ def equilibrium(simulator: Simulator, theta: jax.Array, solution: Solution) -> d
     J = np.asarray(jax.jit(partial(volume_ratio, scene))(u))
     at_rest = not scene.loaded_by
     has_potential = at_rest and all(load.has_potential for load in scene.loads)
-    result = {
+    result: dict[str, Any] = {
         "energy": float(jax.jit(potential_energy(scene))(u, theta)) if has_potential else None,
         "stable": simulator.is_stable(u, theta) if has_potential and converged else None,
         "max_displacement": float(np.linalg.norm(u, axis=1).max()),
