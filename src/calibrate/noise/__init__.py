@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 from calibrate.noise.correlated import CorrelatedNoise
@@ -17,6 +17,8 @@ NOISES: dict[str, type[Noise]] = {
     kind.kind: kind for kind in (GaussianNoise, StudentTNoise, CorrelatedNoise)
 }
 
+_MEDIAN = 0.6745  # of a half-normal of scale 1
+
 __all__ = [
     "NOISES",
     "CorrelatedNoise",
@@ -27,6 +29,7 @@ __all__ = [
     "information_about_means",
     "noise_of",
     "parse_noise",
+    "typical",
     "usage_of",
 ]
 
@@ -39,6 +42,16 @@ def noise_of(description: float | Mapping[str, Any]) -> Noise:
     if not isinstance(description, Mapping):
         description = {"kind": GaussianNoise.kind, "sd": description}
     return schema.restore(NOISES, description, "noise")
+
+
+def typical(noise: Noise) -> Noise:
+    """Return the noise with each scale that is inferred at the median of its half-normal prior."""
+    known: dict[str, Any] = {}
+    for scale in noise.scales:
+        if scale.known is None and scale.prior_scale is not None:
+            value, prior = scale.options
+            known |= {value: _MEDIAN * scale.prior_scale, prior: None}
+    return replace(noise, **known)  # type: ignore[type-var]
 
 
 def usage_of(kind: type[Noise]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from argparse import Namespace
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
 from calibrate.cli import words
@@ -26,15 +26,21 @@ def _before(arguments: Namespace) -> Answer:
     from calibrate.analysis.expected import expected_precision
     from calibrate.analysis.identifiability import products_in_words
     from calibrate.cli.run_words import problem_of
+    from calibrate.noise import typical
     from calibrate.project import model_before_data
 
     problem = problem_of(arguments)
     # Errors that many numbers share are made for each data set, not at one draw of the prior.
     model = model_before_data(problem.change(systematic={}))
+    inferred = [name for name, noise in model.noise.items() if noise.priors]
+    noise = {name: typical(noise) for name, noise in model.noise.items()}
+    model = replace(model, noise=noise)
     expected = expected_precision(model, systematic=problem.run.systematic)
     rows = [(name, f"{100 * ratio:.3g} %") for name, ratio in expected["sd"].items()]
     lines = [table(("parameter", "expected sd / prior sd"), rows)]
     lines += products_in_words(expected["combinations"], len(rows))
+    if inferred:
+        lines.append(f"noise of {', '.join(inferred)}: inferred sds at the median of their prior")
     return Answer(expected, "\n".join(lines))
 
 
