@@ -101,7 +101,8 @@ def test_slow_iterations_are_shown_and_kept_one_by_one(problem, monkeypatch, tmp
         monkeypatch.setattr(f"calibrate.samplers.{name}", value)
     monkeypatch.setattr("emulator.core.display.EVERY", 1e-3)
     slow = run(problem, "nuts", checkpoint=tmp_path / "sampling.safetensors", progress=True)
-    assert len(written) == 2 * (60 + 120)  # of a pilot and of the final run
+    draws = slow.tree["posterior"].sizes["draw"]
+    assert len(written) == 60 + 120 + 60 + draws  # a pilot and the final run, each with its warm-up
     assert "gradients an iteration" in capsys.readouterr().err
     for variable, values in whole.tree["posterior"].data_vars.items():
         np.testing.assert_array_equal(slow.tree["posterior"][variable].values, values.values)
