@@ -160,8 +160,8 @@ def _layouts(file: DataTable) -> dict[str, tuple[type[Observation], Layout]]:
         return complete
     lacking = [[w for w in words if w not in file.words] for words in partial]
     fault = f"{file.what} '{min(lacking, key=len)[0]}' is missing" if partial else "no data"
-    words = "" if partial else ", ".join(filter(None, file.words))
-    fault += f" in {file.what}s {words}" if words else ""
+    present = "" if partial else ", ".join(filter(None, file.words))
+    fault += f" in {file.what}s {present}" if present else ""
     every = " or ".join(
         ",".join(file.words_of(layout))
         for name, kind in OBSERVATIONS.items()
