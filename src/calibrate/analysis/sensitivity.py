@@ -139,6 +139,7 @@ CONFIDENCE = 0.95
 _DEVIATIONS = norm.ppf(0.5 * (1.0 + CONFIDENCE))  # half-width of the interval of a normal, in sd
 _RESAMPLES = 100
 _LEVELS = 4  # levels of Morris' grid
+_FEW = 100  # numbers of an observation whose indices are told one by one
 
 
 def analyse(
@@ -366,3 +367,17 @@ def sensitivity(
             datasets[name] = datasets[name].assign_coords(output=outputs.nodes)
     about = {"forward": forward.label, "scene": scene.name, "method": method, "seed": seed}
     return xr.DataTree.from_dict({"/": xr.Dataset(attrs=about), **datasets})
+
+
+def indices_to_json(indices: xr.DataTree) -> dict[str, Any]:
+    """Return the indices of all numbers together, and of each where they are few, as plain JSON."""
+    result = {str(name): value for name, value in indices.attrs.items()}
+    for node, child in indices.children.items():
+        data = child.to_dataset()
+        few = data.sizes["output"] <= _FEW
+        result[node] = {name: data.attrs[name] for name in ("unit", "evaluations")} | {
+            str(name): values.values.tolist()
+            for name, values in data.variables.items()
+            if few or "output" not in values.dims
+        }
+    return result

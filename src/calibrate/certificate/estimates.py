@@ -140,6 +140,7 @@ def evidence_of(
         in_noise_sd(posterior.model, errors, posterior.draws()),
         box=tuple(posterior.box_ends()),
         noise=tuple(posterior.inferred_noise()),
+        forward=posterior.model.full.kind,
     )
 
 

@@ -201,7 +201,7 @@ class Evidence:
     map_errors : the distance of the map's data from FEM's at the draws, in noise sd.
     mesh : the changes by a finer mesh.
     box : the ends of ranges that end the posterior in place of the data.
-    noise : the noises that are inferred.
+    noise : the noises that are inferred. forward : the kind of the forward map.
     """
 
     draws: Changes
@@ -216,3 +216,4 @@ class Evidence:
     mesh: MeshChange = MeshChange(why="not asked")
     box: tuple[BoxEnd, ...] = ()
     noise: tuple[TakenUp, ...] = ()
+    forward: str = ""

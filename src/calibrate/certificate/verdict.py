@@ -152,7 +152,8 @@ def judge(evidence: Evidence) -> Certificate:
     """
     verdict, agreement = _agreement(evidence)
     faults, others = list(sampling_faults(evidence.sampling, evidence.box)), list(_faults(evidence))
-    wrong_map, agrees = map_fault(evidence.map_errors), verdict in ("accepted", "reweight")
+    wrong_map = map_fault(evidence.map_errors, forward=evidence.forward)
+    agrees = verdict in ("accepted", "reweight")
     mesh_is_fine, mesh = _mesh(evidence.mesh)
     if faults or others or mesh_is_fine is False:
         verdict = "not certified"

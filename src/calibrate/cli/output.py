@@ -6,15 +6,9 @@ import math
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from emulator.core.errors import InputError
-
-if TYPE_CHECKING:
-    import jax
-
-    from emulator.accuracy.estimate import ErrorEstimate
-    from emulator.scenes.scene import Scene
 
 _UNLIMITED = 1_000_000  # columns when the output is a file or a pipe
 
@@ -124,33 +118,10 @@ def members_summary(report: Mapping[str, Any]) -> str:
     return "\n".join(lines + report["warnings"])
 
 
-Volumes = dict[str, dict[str, float | None]]
-
-
-def volumes(scene: Scene, u: jax.Array, estimate: ErrorEstimate | None = None) -> Volumes:
-    """Return each cavity's volume in mL at rest, at ``u`` (n, 3) mm, and its estimated error."""
-    import jax
-
-    from emulator.geometry.facets import Cavity
-    from emulator.scenes.scene import cavity_sets
-
-    result: Volumes = {}
-    for name in cavity_sets(scene):
-        cavity = Cavity(scene.mesh, name)
-
-        def volume(u: jax.Array, cavity: Cavity = cavity) -> jax.Array:
-            return cavity(u[cavity.nodes])
-
-        error = None if estimate is None or not estimate.valid else float(estimate.of(volume))
-        loaded = float(jax.jit(volume)(u))
-        result[name] = {"rest_ml": float(cavity.rest), "volume_ml": loaded, "error_ml": error}
-    return result
-
-
-def volume_lines(volumes_by_cavity: Volumes) -> list[str]:
+def volume_lines(volumes: Mapping[str, Mapping[str, float | None]]) -> list[str]:
     """Return a line for each cavity."""
     lines = []
-    for name, cavity in volumes_by_cavity.items():
+    for name, cavity in volumes.items():
         error = "" if cavity["error_ml"] is None else f", error {cavity['error_ml']:+.2g} mL"
         rest, loaded = cavity["rest_ml"], cavity["volume_ml"]
         lines.append(f"cavity '{name}': {loaded:.6g} mL, at rest {rest:.6g} mL{error}")

@@ -62,7 +62,9 @@ def run_options(*more: str) -> Option:
 
 def _add_run(parser: ArgumentParser, more: Sequence[str]) -> None:
     from calibrate.measurements import OBSERVATIONS
+    from calibrate.measurements.words import usage_of
     from calibrate.noise import NOISES
+    from calibrate.noise import usage_of as usage_of_noise
     from calibrate.project.run import Run
     from emulator.core.schema import documented
 
@@ -80,8 +82,10 @@ def _add_run(parser: ArgumentParser, more: Sequence[str]) -> None:
             text = f"{texts[name].removesuffix('.').replace('%', '%%')}{usual}"
             if word.help is not None:
                 text = word.help.format(
-                    observations=", ".join(kind.usage for kind in OBSERVATIONS.values()),
-                    noises=", ".join(kind.usage for kind in NOISES.values()),
+                    observations="; ".join(
+                        usage_of(kind).partition(";")[0] for kind in OBSERVATIONS.values()
+                    ),
+                    noises="; ".join(map(usage_of_noise, NOISES.values())),
                 )
             about: dict[str, Any] = {"metavar": word.metavar}
             if hints[name] is bool:
@@ -226,7 +230,7 @@ WORDS = {
         "[NAME=]SD",
         "standard deviation by observation, e.g. volume=1.0 displacement=0.2, mL and mm; a bare "
         "number is a single observation's or the displacements' (default 0.2 mm, 1 mL, less for a "
-        "small body). Other noise as displacement=KIND:OPTIONS, {noises}",
+        "small body). Other noise as displacement=KIND:..., {noises}",
         read=noise_words,
     ),
     "noise_scale": Word(

@@ -186,11 +186,6 @@ def theta_of(arguments: Namespace, scene: ForwardProblem) -> jax.Array:
     return scene.theta(**assignments(arguments.theta)) if arguments.theta else scene.centre
 
 
-def theta_by_name(scene: ForwardProblem, theta: Any) -> dict[str, float]:
-    """Return a theta (p,) as a result has it."""
-    return dict(zip(scene.parameter_names, map(float, theta), strict=True))
-
-
 def add_forward(parser: ArgumentParser, default: str | None = "emulator") -> None:
     """Add ``--forward`` and every option of every kind in the registry."""
     from emulator.surrogates.registry import FORWARD_MAPS, known_options

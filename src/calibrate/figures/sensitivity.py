@@ -11,7 +11,9 @@ import xarray as xr
 from calibrate.analysis.sbc import LEVELS, Calibration
 from calibrate.analysis.sensitivity import FIELD
 from calibrate.figures import BLUE, VERMILION, draw_body, panels, pyplot, save
+from emulator.core.store import write_netcdf
 from emulator.geometry.facets import flat_triangles
+from emulator.geometry.io import write_vtu
 from emulator.scenes.scene import Scene
 
 _INSIDE, _OUTSIDE, _BAND = BLUE, VERMILION, "0.85"  # blue and vermilion differ for all readers
@@ -85,6 +87,23 @@ def draw(study: xr.DataTree, scene: Scene, folder: str | Path) -> list[Path]:
     for name, figure in figures.items():
         save(figure, Path(folder) / name)
     return [Path(folder) / name for name in figures]
+
+
+def write(study: xr.DataTree, scene: Scene, folder: str | Path) -> None:
+    """Write the indices as netCDF, their figures, and indices of the nodes as VTU."""
+    write_netcdf(Path(folder) / "sensitivity.nc", study)
+    draw(study, scene, folder)
+    if FIELD in study.children:
+        data = study[FIELD].to_dataset()
+        nodal = {
+            f"{name} {label}": np.nan_to_num(values)
+            for name in ("first", "total", "mu_star", "bound_on_total")
+            if name in data
+            for label, values in zip(
+                data[data[name].dims[0]].values, data[name].values, strict=True
+            )
+        }
+        write_vtu(Path(folder) / "sensitivity.vtu", scene.mesh, point_data=nodal)
 
 
 def index_figure(study: xr.DataTree) -> Any:

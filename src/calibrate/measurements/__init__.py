@@ -46,7 +46,7 @@ from calibrate.measurements.surface import (
     surface_points,
 )
 from calibrate.measurements.volume import CavityVolume
-from calibrate.measurements.words import from_json, parse
+from calibrate.measurements.words import from_json, parse, usage_of
 from calibrate.state_names import in_state, split
 from emulator.core.errors import InputError, look_up
 from emulator.core.rooms import offered
@@ -136,7 +136,7 @@ def _parse_word(scene: ForwardProblem, word: str, seed: int) -> tuple[str, Obser
     if nodes := nodes_called(with_mesh(scene), word):
         return DISPLACEMENT, nodes
     raise InputError(
-        f"observe '{word}': give {', '.join(kind.usage for kind in OBSERVATIONS.values())}; "
+        f"observe '{word}': give {'; '.join(map(usage_of, OBSERVATIONS.values()))}; "
         f"node sets: {', '.join(sorted(with_mesh(scene).mesh.node_sets)) or 'none here'}"
     )
 

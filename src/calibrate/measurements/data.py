@@ -48,12 +48,10 @@ from calibrate.measurements.tables import (
 )
 from calibrate.measurements.words import names_of, parse
 from calibrate.state_names import in_state, split
-from emulator.core.cells import SPREADSHEETS, TEXT, Cells
+from emulator.core.cells import OTHER_SPREADSHEETS, SPREADSHEETS, TEXT, Cells
 from emulator.core.errors import InputError
 from emulator.core.rooms import offered
 from emulator.scenes.forward_problem import ForwardProblem
-
-_OTHER_SPREADSHEETS = (".xls", ".ods")
 
 Files = str | Path | Mapping[str, str]
 """A data file, or the file of each load state by the state's name."""
@@ -84,9 +82,7 @@ def read_measurements(
         file = Path(path)
         if not file.is_file():
             raise InputError(f"data file {path} does not exist")
-        if file.suffix.lower() in _OTHER_SPREADSHEETS:
-            raise InputError(f"data file {path} is a spreadsheet; save it as CSV")
-        of_cells = file.suffix.lower() in (*TEXT, *SPREADSHEETS)
+        of_cells = file.suffix.lower() in (*TEXT, *SPREADSHEETS, *OTHER_SPREADSHEETS)
         by_state: Mapping[str, DataTable]
         if table is not None and table.path.samefile(file):
             by_state = read_csv(table._replace(path=file))
@@ -164,6 +160,8 @@ def _layouts(file: DataTable) -> dict[str, tuple[type[Observation], Layout]]:
         return complete
     lacking = [[w for w in words if w not in file.words] for words in partial]
     fault = f"{file.what} '{min(lacking, key=len)[0]}' is missing" if partial else "no data"
+    present = "" if partial else ", ".join(filter(None, file.words))
+    fault += f" in {file.what}s {present}" if present else ""
     every = " or ".join(
         ",".join(file.words_of(layout))
         for name, kind in OBSERVATIONS.items()

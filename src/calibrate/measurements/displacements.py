@@ -60,7 +60,7 @@ class NodalDisplacements(DisplacementPoints):
     points: np.ndarray
 
     kind = "nodes"
-    usage = "nodes:N, all, a node set, node numbers like 3,14,15"
+    hint = ", or all, a node set, node numbers like 3,14,15"
     place = "nodes"
     place_field = DataField("node", ("node",), where=True)
     spread = staticmethod(spread_nodes)
@@ -128,7 +128,6 @@ class Landmarks(DisplacementPoints):
     weights: np.ndarray
 
     kind = "landmarks"
-    usage = "landmarks:N"
     place_field = DataField("position", XYZ, where=True)
     spread = staticmethod(spread_landmarks)
 
@@ -204,7 +203,7 @@ class Length(Scalar):
     ends: np.ndarray
 
     kind = "length"
-    usage = "length:A:B (each a node, a node set or x,y,z)"
+    hint = ", each a node, a node set or x,y,z"
     quantity = "length"
     unit = "mm"
     usual_sd = 0.5

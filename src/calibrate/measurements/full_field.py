@@ -242,6 +242,63 @@ def spread_points(points: np.ndarray, count: int) -> np.ndarray:
     return np.array(chosen)
 
 
+def measured_field(
+    scene: Scene,
+    files: Sequence[str | Path],
+    amount: Sequence[str],
+    forces: Sequence[Sequence[str]] = (),
+    *,
+    frames: Sequence[str] | None = None,
+    points: int = 60,
+) -> tuple[Observations, dict[str, np.ndarray], dict[str, float]]:
+    """Return the observations of a full field and of forces beside it, their data, and amounts.
+
+    Amounts are those of the parameter that pulls the body, by ``parameter@frame``.
+
+    Parameters
+    ----------
+    scene : as of :func:`field_data`.
+    files : the arguments of :func:`read_full_field`.
+    amount : the parameter that pulls the body, and the file and the column of its amounts.
+    forces : of each force, the observation, such as ``reaction:pad:x``, a file, and its columns of
+        the amount and of the force in N.
+    frames : the frames that are data; by default all in which the body is pulled.
+    points : the largest number of points, spread as far from each other as they go.
+
+    Raises
+    ------
+    InputError
+        What the functions of this file refuse, a force that is there twice, or a frame at which it
+        was not measured.
+    """
+    from calibrate.measurements import parse_observation
+
+    (parameter, path, column), field = amount, read_full_field(*files)
+    amounts = read_amounts(path, column)
+    sign = sign_of(scene, parameter, amounts)
+    amounts = {frame: sign * value for frame, value in amounts.items()}
+    pulled = [frame for frame in field.frames if amounts.get(frame) != 0.0]
+    chosen = spread_points(field.points, min(points, len(field.points)))
+    field = field.only(frames or pulled, chosen)
+    observe, data = field_data(scene, field, amounts)
+    parts = dict(observe.parts)
+    for word, path, pull, force in forces:
+        at, forces_at = read_curve(path, pull, force, list(amounts.values()))
+        ((name, part),) = parse_observation(scene, word, 0).parts.items()
+        if in_state(name, field.frames[0]) in parts:
+            raise InputError(f"force: {word} is given twice; give one curve for each")
+        for frame in field.frames:
+            if not at[0] <= amounts[frame] <= at[-1]:
+                raise InputError(
+                    f"force: {path} goes from {at[0]:.4g} to {at[-1]:.4g}, frame '{frame}' is at "
+                    f"{amounts[frame]:.4g}"
+                )
+            parts[in_state(name, frame)] = part
+            data[in_state(name, frame)] = np.array(np.interp(amounts[frame], at, forces_at))
+    known = {in_state(parameter, frame): amounts[frame] for frame in field.frames}
+    return observations(parts), data, known
+
+
 def field_data(
     scene: Scene, field: FullField, amounts: Mapping[str, float], facet_set: str = "top"
 ) -> tuple[Observations, dict[str, np.ndarray]]:

@@ -154,8 +154,7 @@ class KlotzVolume(Scalar):
     column: int = field(init=False)
 
     kind = "klotz"
-    usage = "klotz:PRESSURE (kPa)"
-    hint = ", such as klotz:1.3"
+    hint = " in kPa, such as klotz:1.3"
     quantity = "volume"
     unit = CavityVolume.unit
     arguments = ("measured_pressure",)

@@ -65,8 +65,7 @@ class Observation(ABC):
     ``kind:argument:argument``. A kind is a frozen dataclass that declares
 
     kind : its name in the registry, in JSON and on the command line.
-    usage : the words that ask for it, for help and errors.
-    hint : the text that an error adds to the usage.
+    hint : the text that help and errors add to the words that ask for it.
     arguments : the names of the arguments of ``of`` that words give, attributes of the observation.
     kind_is_name : whether it may be called as its kind in a data file, without arguments.
     quantity : the measured quantity, such as ``displacement``.
@@ -77,7 +76,6 @@ class Observation(ABC):
     """
 
     kind: ClassVar[str]
-    usage: ClassVar[str]
     hint: ClassVar[str] = ""
     arguments: ClassVar[tuple[str, ...]]
     kind_is_name: ClassVar[bool] = False

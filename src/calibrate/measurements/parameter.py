@@ -28,7 +28,6 @@ class MeasuredParameter(Scalar):
     parameter: str
 
     kind = "parameter"
-    usage = "parameter:NAME"
     quantity = "parameter"
     arguments = ("parameter",)
     positive = False

@@ -38,7 +38,6 @@ class Reaction(Scalar):
     force: SupportForce = field(init=False)
 
     kind = "reaction"
-    usage = "reaction:SUPPORT:AXIS"
     hint = ", such as reaction:top:x"
     quantity = "force"
     unit = "N"

@@ -126,7 +126,6 @@ class PointStrain(Strains):
     """
 
     kind = "strain"
-    usage = "strain:COMPONENT,...:N"
     name = "strain"
     place_field = DataField("position_strain", XYZ, where=True)
     spread = staticmethod(lambda scene, _, count, seed: spread_landmarks(scene, count, seed))
@@ -168,7 +167,6 @@ class SegmentStrain(Strains):
     weights: np.ndarray
 
     kind = "segment_strain"
-    usage = "segment_strain:COMPONENT,..."
     name = "segment_strain"
     prefix = "mean_"
     place = numbers = "segments"

@@ -63,7 +63,6 @@ class Stress(Components):
     shares: jax.Array | None = None
 
     kind = "stress"
-    usage = "stress:COMPONENT,..."
     hint = ", such as stress:stress_x,stress_y"
     name = "stress"
     quantity = "stress"

@@ -45,7 +45,6 @@ class Stretch(Components):
     components: tuple[str, ...]
 
     kind = "stretches"
-    usage = "stretches:COMPONENT,..."
     hint = ", such as stretches:stretch_x,stretch_y"
     name = "stretch"
     quantity = "stretch"

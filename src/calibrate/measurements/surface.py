@@ -103,7 +103,6 @@ class SurfacePoints(OfFacetSet):
     weights: np.ndarray
 
     kind = "surface"
-    usage = "surface:FACETSET:N"
     quantity = "normal displacement"
     unit = "mm"
     usual_sd = 0.5
@@ -188,7 +187,7 @@ class RigidMarkers(DisplacementPoints, OfFacetSet):
     variance: np.ndarray
 
     kind = "markers"
-    usage = "markers:FACETSET (positions from a file)"
+    hint = ", positions from a file"
     quantity = "marker displacement"
     name = "markers:{}"
     place_field = DataField("position_markers_{}", XYZ, where=True)

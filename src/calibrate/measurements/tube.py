@@ -84,7 +84,7 @@ class OfTube(SpecimenCurves):
 class TubePressure(OfTube):
     """Pressures (d,) in kPa inside a tube, in each of its states."""
 
-    kind = name = usage = "tube_pressure"
+    kind = name = "tube_pressure"
     quantity = "pressure"
     column = "pressure"
     unit = "kPa"
@@ -95,7 +95,7 @@ class TubePressure(OfTube):
 class TubeForce(OfTube):
     """Reduced axial forces (d,) in mN of a tube, in each of its states."""
 
-    kind = name = usage = "tube_force"
+    kind = name = "tube_force"
     quantity = "force"
     column = "force_axial"
     unit = "mN"

@@ -39,7 +39,6 @@ class CavityVolume(Scalar):
     cavity: Cavity = field(init=False)
 
     kind = "volume"
-    usage = "volume, volume:FACETSET"
     quantity = "volume"
     unit = "mL"
     usual_sd = 1.0

@@ -21,6 +21,18 @@ def names_of(part: Observation) -> tuple[str, ...]:
     return (part.kind, name) if part.kind_is_name else (name,)
 
 
+def usage_of(kind: type[Observation]) -> str:
+    """Return the words that ask for a kind, for help and errors."""
+    words = [
+        f"{name[:-1]},...".upper() if name.endswith("s") else name.replace("_", "").upper()
+        for name in kind.arguments
+    ]
+    if issubclass(kind, PointObservation) and kind.spread is not None:
+        words.append("N")
+    usage = ":".join([kind.kind, *words])
+    return f"{kind.kind}, {usage}{kind.hint}" if kind.kind_is_name and words else usage + kind.hint
+
+
 def parse(
     kind: type[Observation], scene: ForwardProblem, word: str, seed: int = 0
 ) -> tuple[str, Observation]:
@@ -32,7 +44,7 @@ def parse(
     :class:`InputError` for a word that the kind cannot read.
     """
     spread = kind.spread if issubclass(kind, PointObservation) else None
-    misuse = InputError(f"observe '{word}': give {kind.usage}{kind.hint}")
+    misuse = InputError(f"observe '{word}': give {usage_of(kind)}")
     rest = word.partition(":")[2]
     count = len(kind.arguments) + (spread is not None)
     texts = rest.split(":") if count > 1 else [rest] if count or rest else []

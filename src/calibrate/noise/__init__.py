@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields, replace
 from typing import Any
 
 from calibrate.noise.correlated import CorrelatedNoise
@@ -16,6 +17,8 @@ NOISES: dict[str, type[Noise]] = {
     kind.kind: kind for kind in (GaussianNoise, StudentTNoise, CorrelatedNoise)
 }
 
+_MEDIAN = 0.6745  # of a half-normal of scale 1
+
 __all__ = [
     "NOISES",
     "CorrelatedNoise",
@@ -26,6 +29,8 @@ __all__ = [
     "information_about_means",
     "noise_of",
     "parse_noise",
+    "typical",
+    "usage_of",
 ]
 
 
@@ -39,6 +44,22 @@ def noise_of(description: float | Mapping[str, Any]) -> Noise:
     return schema.restore(NOISES, description, "noise")
 
 
+def typical(noise: Noise) -> Noise:
+    """Return the noise with each scale that is inferred at the median of its half-normal prior."""
+    known: dict[str, Any] = {}
+    for scale in noise.scales:
+        if scale.known is None and scale.prior_scale is not None:
+            value, prior = scale.options
+            known |= {value: _MEDIAN * scale.prior_scale, prior: None}
+    return replace(noise, **known)  # type: ignore[type-var]
+
+
+def usage_of(kind: type[Noise]) -> str:
+    """Return the word of a kind and its options on the command line, for help and errors."""
+    options = (field.name for field in fields(kind) if field.name != "sites")  # type: ignore[arg-type]
+    return f"{kind.kind}:OPTION=VALUE,... of {', '.join(options)}"
+
+
 def parse_noise(text: str) -> float | dict[str, Any]:
     """Return the description of ``0.2`` or ``student_t:dof=4,scale=0.2``, for :func:`noise_of`.
 
@@ -49,13 +70,15 @@ def parse_noise(text: str) -> float | dict[str, Any]:
         try:
             return float(text)
         except ValueError as error:
-            usage = ", ".join(kind.usage for kind in NOISES.values())
+            usage = "; ".join(usage_of(kind) for kind in NOISES.values())
             raise InputError(f"'{text}' is neither a number nor a noise; give {usage}") from error
     description: dict[str, Any] = {"kind": kind}
     for option in options.split(",") if options else ():
         name, equals, value = option.partition("=")
         if not equals:
-            raise InputError(f"'{text}': '{option}' is not option=value; give {NOISES[kind].usage}")
+            raise InputError(
+                f"'{text}': '{option}' is not option=value; give {usage_of(NOISES[kind])}"
+            )
         description[name] = _number(value)
     noise_of(description)  # refuses options that the kind does not take
     return description

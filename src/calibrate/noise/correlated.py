@@ -166,7 +166,6 @@ class CorrelatedNoise(Noise):
     sites: Sites | None = field(default=None, compare=False, repr=False)
 
     kind: ClassVar[str] = "correlated"
-    usage: ClassVar[str] = "correlated:length=MM,sd=SD,spatial_sd=SD"
 
     def __post_init__(self) -> None:
         check_positive("correlation length (mm)", self.length)

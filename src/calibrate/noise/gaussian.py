@@ -30,7 +30,6 @@ class GaussianNoise(Noise):
     sd_scale: float | None = None
 
     kind: ClassVar[str] = "gaussian"
-    usage: ClassVar[str] = "gaussian:sd=SD"
 
     @property
     def scales(self) -> tuple[Scale, ...]:

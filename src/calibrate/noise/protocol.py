@@ -92,12 +92,10 @@ class Noise(ABC):
 
     kind : its name in the registry and in JSON.
     gaussian : whether it is Gaussian where all its numbers are known.
-    usage : its options on the command line, for help and errors.
     """
 
     kind: ClassVar[str]
     gaussian: ClassVar[bool] = True
-    usage: ClassVar[str]
 
     def __post_init__(self) -> None:
         self.scales  # noqa: B018 - scales that cannot be are refused here

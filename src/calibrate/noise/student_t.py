@@ -40,7 +40,6 @@ class StudentTNoise(Noise):
 
     kind: ClassVar[str] = "student_t"
     gaussian: ClassVar[bool] = False
-    usage: ClassVar[str] = "student_t:dof=DOF,scale=SCALE"
 
     def __post_init__(self) -> None:
         check_positive("number of degrees of freedom", self.dof)

@@ -23,6 +23,7 @@ from calibrate.statistical_model import Model
 from emulator.core.display import TableRepr
 from emulator.core.errors import InputError, look_up
 from emulator.core.store import write_netcdf
+from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.parameter_space import Parameter
 
 ALONE, NEW, CORRELATION = "alone", "new_member", "correlation"
@@ -163,15 +164,17 @@ class Hierarchy(TableRepr):
 
     def box_ends(self) -> list[BoxEnd]:
         """Return the ends of ranges that end members' posteriors in place of the data."""
-        box = {}
+        box, limits = {}, dict[str, Quantity]()
         for name in self.shared:
             about = self.tree["posterior"][name].attrs
             if "box" in about:
-                low, high = map(float, about["box"])
+                low, high, *nature = map(float, about["box"])
+                if nature:
+                    limits[name] = Quantity(name, low=nature[0], high=nature[1])
                 box[name] = Parameter(name, about["units"], low, high, about["scale"])
         ends = []
         for member in self.members:
-            member_ends = box_ends(self.member(member), box)
+            member_ends = box_ends(self.member(member), box, limits)
             ends += [replace(end, name=f"{end.name}[{member}]") for end in member_ends]
         return sorted(ends, key=lambda end: -end.shift)
 
@@ -229,7 +232,9 @@ def make_tree(
         for group in ("posterior", NEW):
             tree[group][name].attrs.update(units=parameter.unit or "1", scale=parameter.scale)
         if all(name in member.boxed for member in model.members.values()):
-            tree["posterior"][name].attrs["box"] = [parameter.low, parameter.high]
+            limits = next(iter(model.members.values())).forward.scene.quantities[name]
+            box = [parameter.low, parameter.high, limits.low, limits.high]
+            tree["posterior"][name].attrs["box"] = box
     return tree
 
 

@@ -23,10 +23,10 @@ In a wider box the mean would move by
 .. math:: \Delta = \frac{M_+ (m_+ - \bar x) + M_- (m_- - \bar x)}{1 + M_+ + M_-}
 
 where :math:`E` is three sd of the draws along :math:`d`, or less where a box that is wider by half
-on each side ends (:meth:`Parameter.wider`). Where far fewer draws are at the exit than the fit
-says, as between separate modes and an end, the end is none. The directions are the axes and the
-principal axes of the draws. A posterior that is about as wide as the box along :math:`d` is left
-open by the data; it claims nothing there.
+on each side ends (:func:`~emulator.scenes.finer.wider_within`). Where far fewer draws are at the
+exit than the fit says, as between separate modes and an end, the end is none. The directions are
+the axes and the principal axes of the draws. A posterior that is about as wide as the box along
+:math:`d` is left open by the data; it claims nothing there.
 """
 
 from __future__ import annotations
@@ -40,9 +40,12 @@ import numpy as np
 from calibrate.state_names import split
 from emulator.core.machine import one_blas_thread
 from emulator.core.minimise import minimise
+from emulator.mechanics.laws.law import Quantity
+from emulator.scenes.finer import wider_within
 from emulator.scenes.parameter_space import Parameter
 
 LARGEST_SHIFT = 0.5  # posterior sd by which a wider box may move a mean: as for a finer mesh
+_NO_LIMITS = Quantity("", low=-np.inf)
 _OPEN = 0.8  # posterior sd over the box's, above which the data leave a direction open
 _NEAR = 0.9  # quantile of the distances up to which their density is fitted
 _FAR = 3.0  # posterior sd to which a density is continued, and the largest shift that is meant
@@ -72,20 +75,27 @@ class BoxEnd:
 
 
 @one_blas_thread()
-def box_ends(draws: Mapping[str, np.ndarray], box: Mapping[str, Parameter]) -> list[BoxEnd]:
+def box_ends(
+    draws: Mapping[str, np.ndarray],
+    box: Mapping[str, Parameter],
+    quantities: Mapping[str, Quantity] = {},
+) -> list[BoxEnd]:
     """Return the ends of ranges that end the posterior in place of the data, the worst first.
 
     Parameters
     ----------
     draws : the draws (s,) of each unknown. box : the range of each unknown whose prior is a box.
+    quantities : the limits of each parameter's values by nature, by its name.
     """
     names = [n for n in box if np.ptp(draws[n]) > 0.0]
     if not names:
         return []
     x = np.stack([box[n].to_unit(jnp.ravel(draws[n])) for n in names], axis=1)
     x = np.clip(x, 0.0, 1.0)
-    ranges = np.array([(box[n].wider().low, box[n].wider().high) for n in names])
-    wide = np.stack([box[n].to_unit(jnp.asarray(r)) for n, r in zip(names, ranges, strict=True)])
+    ranges = [wider_within(box[n], quantities.get(box[n].name, _NO_LIMITS)) for n in names]
+    wide = np.stack(
+        [box[n].to_unit(jnp.array([r.low, r.high])) for n, r in zip(names, ranges, strict=True)]
+    )
     wider = np.abs(wide - [0.0, 1.0]).T
     covariance = np.atleast_2d(np.cov(x, rowvar=False))
     directions = np.vstack([np.eye(len(names)), np.linalg.eigh(covariance)[1].T])

@@ -33,6 +33,8 @@ from calibrate.samplers import diagnostics as limits
 from calibrate.samplers import r_hat
 from calibrate.samplers.importance import SEEN_ONCE
 from calibrate.samplers.modes import MISSED_AT, MISSED_BY
+from emulator.surrogates.corrected import CORRECTED
+from emulator.surrogates.registry import FORWARD_MAPS
 
 # Attributes of a run, as JSON: errors of the map at its draws, and sentences on noises by default.
 MAP_ERRORS, SCALED_NOISE = "map_errors", "scaled_noise"
@@ -99,12 +101,15 @@ def sampling_faults(s: Sampling, box: Sequence[BoxEnd] = ()) -> Iterator[Fault]:
         )
 
 
-def map_fault(errors: Mapping[str, float], moves: float = np.nan) -> Fault | None:
+def map_fault(
+    errors: Mapping[str, float], moves: float = np.nan, forward: str = ""
+) -> Fault | None:
     """Return the fault of the forward map, if its error exceeds limits on data or on means.
 
     errors : the distance of the map's data from FEM's at the draws, in noise sd, by observation.
     moves : the largest move of a posterior mean that FEM is expected to make, in its sd; NaN where
         nobody asked, infinite where FEM finds a part that the posterior lacks.
+    forward : the kind of the map.
     """
     sizes = {name: np.inf if np.isnan(size) else size for name, size in errors.items()}
     worst = max(sizes, key=sizes.__getitem__, default="")
@@ -114,12 +119,14 @@ def map_fault(errors: Mapping[str, float], moves: float = np.nan) -> Fault | Non
         f"{value:.2g} {unit}" if np.isfinite(value) else "an unknown amount"
         for value, unit in ((sizes[worst], "noise sd"), (moves, "sd"))
     )
+    closer = FORWARD_MAPS.get(forward, CORRECTED).closer
     consequence = f", and FEM in its place would move a mean by {most}"
     most = consequence if moves > LARGEST_MAP_MOVE else ""
     return (
         f"the forward map misses FEM by {size} in {worst} at the draws{most}",
-        "infer with --forward corrected (or more of its --steps), or let the map's error widen the "
-        "posterior (--error-runs N)",
+        f"infer with {closer}, or let the map's error widen the posterior (--error-runs N)"
+        if closer
+        else "let the map's error widen the posterior (--error-runs N)",
     )
 
 
@@ -181,7 +188,9 @@ def diagnose(
     """
     yield from json.loads(attributes.get(SCALED_NOISE, "[]"))
     wrong_map = map_fault(
-        json.loads(attributes.get(MAP_ERRORS, "{}")), attributes.get(MAP_MOVES, np.nan)
+        json.loads(attributes.get(MAP_ERRORS, "{}")),
+        attributes.get(MAP_MOVES, np.nan),
+        str(attributes.get("forward", "")),
     )
     if wrong_map is not None:
         yield ": ".join(wrong_map)

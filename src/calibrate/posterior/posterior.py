@@ -145,7 +145,7 @@ class Posterior(TableRepr):
 
     def box_ends(self) -> list[BoxEnd]:
         """Return the ends of ranges that end the posterior in place of the data, worst first."""
-        return box_ends(self.draws(), self.model.box)
+        return box_ends(self.draws(), self.model.box, self.model.forward.scene.quantities)
 
     def save(self, path: str | Path) -> None:
         """Write the DataTree as netCDF, whole or not at all."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -37,7 +38,8 @@ _GRIPS = (
     '# held = "clamped"   # or "hooks"',
     "# marks = 2.0   # mm, side of the square in which stretches were measured; not of the grips",
 )
-_Sizes = dict[str, tuple[SpecimenCurves, float]]  # each measurement, and its largest way from rest
+_Sizes = dict[str, tuple[SpecimenCurves, np.ndarray]]  # each measurement, and its data (m, c)
+_DRIFT = 0.05  # share of the largest number by which it may change while the motion is held
 
 
 class SpecimenDraft(NamedTuple):
@@ -85,13 +87,13 @@ def draft_specimen(
         raise InputError(f"data file {table} does not exist")
     cells = read_cells(table)
     states = read_states(cells, tube)
-    largest, slope = _size(cells, states, tube)
+    measured, slope = _size(cells, states, tube)
     motion = (np.diagonal(states.gradients, axis1=1, axis2=2) != 0.0) | (states.pulls != 0.0)
     axes = [axis for axis, column in zip(AXES, motion.T, strict=True) if column.any()]
     chosen = "holzapfel_gasser_ogden" if len(axes) > 1 else "holzapfel_ogden_isotropic"
     material = find_law(law or chosen)
     of_law = f"law {material.name}" + ("" if law else ": a guess, give --law NAME")
-    notes = _notes(cells, states, of_law, largest, slope, tube)
+    notes = _notes(cells, of_law, measured, slope, tube)
     folder = scene_path.resolve().parent
     source = table.resolve()
     name = source.relative_to(folder) if source.is_relative_to(folder) else source
@@ -106,39 +108,67 @@ def draft_specimen(
     except InputError:
         scene_path.unlink()
         raise
-    out.write_text(_experiment_text(scene_path.name, name.as_posix(), largest, notes), "utf-8")
+    out.write_text(_experiment_text(scene_path.name, name.as_posix(), measured, notes), "utf-8")
     return SpecimenDraft(out, scene_path, scene, tuple(notes))
 
 
 def _notes(
-    cells: Cells, states: States, of_law: str, largest: _Sizes, slope: float, tube: Tube | None
+    cells: Cells, of_law: str, measured: _Sizes, slope: float, tube: Tube | None
 ) -> list[str]:
     """Return one sentence per value that was read or guessed; ``of_law`` is the one on the law."""
+    part, _ = next(iter(measured.values()))
+    axes = ["stretch_around", "stretch_axial"] if tube else [f"stretch_{a}" for a in AXES]
+    motions = zip(axes, part.stretches.T, strict=False)
     notes = [
-        f"{len(states.free) // (tube.size if tube else 1)} states in {_tests(states)}",
-        of_law,
+        f"{len(part.states.free)} states in {_tests(part.states)}",
+        *(f"{n} from {x.min():.4g} to {x.max():.4g}" for n, x in motions if np.ptp(x) > 0.0),
         *(
-            f"{name} reaches {part.at_rest + most:.3g} {part.unit}".removesuffix(" 1")
-            for name, (part, most) in largest.items()
+            f"{name} reaches {_farthest(data, part.at_rest):.3g} {part.unit}".removesuffix(" 1")
+            for name, (part, data) in measured.items()
         ),
+        *_drifts(list(cells.rows), part.states, measured),
+        of_law,
         f"ranges of moduli follow from a stiffness of {slope:.3g} kPa",
         *([] if tube else ['grips = "none": stresses are taken to be even']),
         "incompressible, --forward homogeneous takes the law's kappa; certificates take it, too",
         *(
             f"errors along a curve of {name} correlate over {part.usual_length[0]:g} "
             f"{part.usual_length[1]}, their sds are inferred"
-            for name, (part, _) in largest.items()
+            for name, (part, _) in measured.items()
         ),
     ]
     of_tube = (TubePressure.column, TubeForce.column)
     names = {word: with_unit(word) for word in cells.words}
     pulls = pull_columns(names).values()
-    measured = [w for w, (n, _) in names.items() if is_stress(w) or w in pulls or n in of_tube]
-    if bare := [w for w in measured if not names[w][1]]:
+    stresses = [w for w, (n, _) in names.items() if is_stress(w) or w in pulls or n in of_tube]
+    if bare := [w for w in stresses if not names[w][1]]:
         notes.insert(1, f"{', '.join(bare)} without a unit: kPa, forces mN; others in brackets")
     if cells.unloading:
         notes.insert(1, f"{cells.unloading} rows of unloading are left out")
     return notes
+
+
+def _farthest(data: np.ndarray, at_rest: float) -> float:
+    """Return the number that is farthest from the one at rest."""
+    return float(np.ravel(data)[np.nanargmax(np.abs(data - at_rest))])
+
+
+def _drifts(numbers: Sequence[int], states: States, measured: _Sizes) -> Iterator[str]:
+    """Say where a test stays in one state while its data change, as in relaxation and creep.
+
+    numbers : the number of each row in the file.
+    """
+    for rows in states.holds():
+        for name, (part, data) in measured.items():
+            column = int(np.argmax(np.nan_to_num(np.ptp(data[rows], axis=0))))
+            values = data[rows, column]
+            if np.ptp(values) > _DRIFT * np.nanmax(np.abs(data - part.at_rest)):
+                unit = "" if part.unit == "1" else f" {part.unit}"
+                yield (
+                    f"CHANGE: rows {numbers[rows[0]]} to {numbers[rows[-1]]} hold one state, in "
+                    f"which {name} goes from {values[0]:.3g} to {values[-1]:.3g}{unit}: an elastic "
+                    "law has one number there, leave the hold out"
+                )
 
 
 def _tests(states: States) -> str:
@@ -161,13 +191,10 @@ def _size(cells: Cells, states: States, tube: Tube | None) -> tuple[_Sizes, floa
     parts = {n: part for n, part in observe.parts.items() if isinstance(part, SpecimenCurves)}
     if len(parts) < len(data):
         raise InputError(f"data file {cells.path} has {', '.join(observe.parts)} besides stresses")
-    ways = {
-        name: np.nan_to_num(np.abs(data[name] - part.at_rest)).reshape(len(data[name]), -1)
-        for name, part in parts.items()
-    }
-    sizes = {name: (part, float(ways[name].max())) for name, part in parts.items()}
-    for name, (part, most) in sizes.items():
-        if not most > 0.0:
+    sizes = {name: (part, data[name].reshape(len(data[name]), -1)) for name, part in parts.items()}
+    ways = {name: np.nan_to_num(np.abs(y - part.at_rest)) for name, (part, y) in sizes.items()}
+    for name, part in parts.items():
+        if not ways[name].max() > 0.0:
             raise InputError(f"data file {cells.path}: each {name} is {part.at_rest or 'zero'}")
     motion = np.abs(neutral.measured.gradients).max(axis=(1, 2))
     stress = np.abs(neutral.measured.pulls).max(axis=1)
@@ -255,7 +282,8 @@ def _parameter(quantity: Quantity, slope: float) -> list[str]:
 def _experiment_text(scene: str, table: str, sizes: _Sizes, notes: list[str]) -> str:
     head = ["# A first experiment file; what was guessed:", *(f"# - {note}" for note in notes)]
     head += ["", f'scene = "{scene}"', f'data = "{table}"', 'forward = "incompressible"']
-    for name, (part, largest) in sizes.items():
+    for name, (part, data) in sizes.items():
+        largest = abs(_farthest(data, part.at_rest) - part.at_rest)
         sd, (length, of_what) = f"{_NOISE * largest:.2g}", part.usual_length
         unit = "" if part.unit == "1" else f"{part.unit}, "
         head += [

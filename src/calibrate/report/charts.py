@@ -37,6 +37,15 @@ def translucent(colour: str, opacity: float) -> str:
     return f"rgba({int(colour[1:3], 16)}, {int(colour[3:5], 16)}, {int(colour[5:], 16)}, {opacity})"
 
 
+def band(x: Any, y: Any, colour: str, opacity: float, **about: Any) -> go.Scatter:
+    """Return the area between two curves, whose ``x`` or ``y`` is a pair of low and high ends."""
+    ends = [np.r_[c[0], c[1][::-1]] if isinstance(c, tuple) else np.r_[c, c[::-1]] for c in (x, y)]
+    return go.Scatter(
+        x=ends[0], y=ends[1], fill="toself", fillcolor=translucent(colour, opacity), line_width=0,
+        hoverinfo="skip", mode="lines", **about,
+    )  # fmt: skip
+
+
 def inside(values: np.ndarray, data: np.ndarray) -> np.ndarray:
     """Return whether each present datum (m,) lies within the central 90 % of its predictions.
 
@@ -115,11 +124,7 @@ def _curves(
     figure = go.Figure()
     for k, (label, (x, rows)) in enumerate(curves.items()):
         colour = COLOURS[k % len(COLOURS)]
-        figure.add_scatter(
-            x=[*x, *x[::-1]], y=[*high[rows], *low[rows][::-1]], fill="toself", line_width=0,
-            fillcolor=translucent(colour, 0.25), hoverinfo="skip", showlegend=False,
-            mode="lines",
-        )  # fmt: skip
+        figure.add_trace(band(x, (high[rows], low[rows]), colour, 0.25, showlegend=False))
         figure.add_scatter(
             x=x, y=data[rows], mode="markers", marker={"color": colour, "size": 6}, name=label
         )
@@ -201,15 +206,12 @@ def stress(posterior: Posterior) -> go.Figure:
     figure = go.Figure()
     fibres = posterior.model.forward.scene.law.fibres
     for direction, colour in (("fibre", BLUE), ("cross-fibre", VERMILION))[: 2 if fibres else 1]:
-        band = stress_band(posterior, direction)
+        of_stretch = stress_band(posterior, direction)
         label = f"along the {direction}" if fibres else "in any direction"
+        ends = of_stretch.high, of_stretch.low
+        figure.add_trace(band(of_stretch.stretch, ends, colour, 0.2, name=f"90 %, {label}"))
         figure.add_scatter(
-            x=[*band.stretch, *band.stretch[::-1]], y=[*band.high, *band.low[::-1]], fill="toself",
-            fillcolor=translucent(colour, 0.2), line_width=0, name=f"90 %, {label}",
-            hoverinfo="skip",
-        )  # fmt: skip
-        figure.add_scatter(
-            x=band.stretch, y=band.median, line_color=colour, name=f"median, {label}"
+            x=of_stretch.stretch, y=of_stretch.median, line_color=colour, name=f"median, {label}"
         )
     figure.update_layout(xaxis_title="stretch", yaxis_title="Cauchy stress difference (kPa)")
     return figure
@@ -229,11 +231,7 @@ def volume_band(posterior: Posterior) -> go.Figure | None:
     data_volumes = _measured_volumes(posterior, curve)
     figure = go.Figure()
     _add_klotz(figure, curve, middle, data_volumes)
-    figure.add_scatter(
-        x=[*low, *high[::-1]], y=[*p, *p[::-1]], fill="toself",
-        fillcolor=translucent(BLUE, 0.22), line_width=0, name="90 % of the posterior",
-        hoverinfo="skip",
-    )  # fmt: skip
+    figure.add_trace(band((low, high), p, BLUE, 0.22, name="90 % of the posterior"))
     figure.add_scatter(
         x=middle, y=p, mode="lines", line_color=BLUE, name="median",
         text=[in_mmhg(pressure) for pressure in p], hovertemplate="%{x:.1f} mL at %{text}",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,6 +18,7 @@ from markupsafe import Markup
 from plotly.io import to_html
 from plotly.offline import get_plotlyjs
 
+from calibrate.figures import pyplot
 from calibrate.project import Run
 
 GOOD, UNSURE, BAD = "#00684a", "#8a5a00", "#9c2a00"
@@ -99,6 +101,15 @@ def chart(figure: go.Figure) -> Markup:
     # Not played: a body is shown at its mean, not in motion through the draws.
     options = {"full_html": False, "include_plotlyjs": False, "auto_play": False}
     return Markup(to_html(figure, config={"displaylogo": False}, **options))
+
+
+def picture(figure: Any) -> Markup:
+    """Return a figure of :mod:`calibrate.figures` as it is, drawn by no library."""
+    text = io.StringIO()
+    with pyplot().rc_context({"svg.hashsalt": "page", "svg.fonttype": "none"}):
+        figure.savefig(text, format="svg", metadata={"Date": None})
+    pyplot().close(figure)
+    return Markup(text.getvalue()[text.getvalue().index("<svg") :])
 
 
 def summary_cells(row: Mapping[str, float]) -> list[str]:

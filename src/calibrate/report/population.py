@@ -5,21 +5,17 @@ A certificate belongs to a member, so the page repeats the members' verdicts and
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
-import plotly.graph_objects as go
 import xarray as xr
 from markupsafe import Markup
-from plotly.subplots import make_subplots
 
-from calibrate.figures import BLUE, VERMILION
-from calibrate.figures.shrinkage import APART, Intervals, intervals_of, label_of
+from calibrate.figures.shrinkage import figure_of, label_of
 from calibrate.population import Hierarchy
 from calibrate.population.model import MEDIAN, SD
 from calibrate.population.posterior import CORRELATION
@@ -29,74 +25,7 @@ from calibrate.project.calibration import NOT_CERTIFIED
 from calibrate.project.members import Members, Shared, verdicts_in
 from calibrate.project.results import MEMBERS, POPULATION, POSTERIOR, REPORT
 from calibrate.report import charts, parts
-from calibrate.report.charts import translucent
 from calibrate.report.parts import Verdict
-
-_GREY = "#8c8c8c"
-_COLUMNS = 3  # parameters beside each other, at most
-_ROW, _MARGIN = 34, 110  # heights in pixels: of a member, and around a row of parameters
-
-
-def shrinkage(population: Hierarchy) -> go.Figure:
-    """Return medians and central 90 % intervals of each shared unknown, a row a member.
-
-    Grey: by the member's own data. Blue: with the others. The band is a member not seen.
-    """
-    names, members = population.shared, population.members
-    lines = math.ceil(len(names) / _COLUMNS)
-    columns = math.ceil(len(names) / lines)  # four names make two rows of two
-    height = _ROW * len(members) + _MARGIN
-    figure = make_subplots(
-        lines, columns, shared_yaxes=True, horizontal_spacing=0.04,
-        vertical_spacing=0.0 if lines == 1 else 0.8 * _MARGIN / (height * lines),
-    )  # fmt: skip
-    edges = (len(members) - 0.4, -0.6)  # the first member on top
-    for k, name in enumerate(names):
-        row, column = k // columns + 1, k % columns + 1
-        for trace in _traces(intervals_of(population, name), members, edges):
-            figure.add_trace(trace if k == 0 else trace.update(showlegend=False), row, column)
-        figure.update_xaxes(title_text=label_of(population, name), row=row, col=column)
-        ticks = {"tickvals": list(range(len(members))), "ticktext": members}
-        figure.update_yaxes(range=edges, **ticks, automargin=True, row=row, col=column)
-    legend = {"orientation": "h", "x": 0.0, "y": 1.02, "yanchor": "bottom"}
-    figure.update_layout(height=lines * height, legend=legend)
-    return figure
-
-
-def _traces(
-    intervals: Intervals, members: tuple[str, ...], edges: tuple[float, float]
-) -> Iterator[go.Scatter]:
-    """Yield band and median of a member not seen, then the intervals of all members."""
-    low, middle, high = intervals.new
-    yield go.Scatter(
-        x=[low, high, high, low], y=[edges[0], edges[0], edges[1], edges[1]], fill="toself",
-        fillcolor=translucent(VERMILION, 0.16), line_width=0, mode="lines", hoverinfo="skip",
-        name="a member not seen, and its median", legendgroup="new",
-    )  # fmt: skip
-    yield go.Scatter(
-        x=[middle, middle], y=edges, mode="lines", line={"color": VERMILION, "width": 1.5},
-        hoverinfo="skip", showlegend=False, legendgroup="new",
-    )  # fmt: skip
-    rows = np.arange(len(members))
-    yield _interval_trace(intervals.alone, rows - APART, members, _GREY, "alone")
-    yield _interval_trace(intervals.together, rows + APART, members, BLUE, "with the others")
-
-
-def _interval_trace(
-    ends: np.ndarray, rows: np.ndarray, members: tuple[str, ...], colour: str, name: str
-) -> go.Scatter:
-    """Return a dot and a line for each interval ``ends`` (3, n), at the heights ``rows`` (n,)."""
-    low, middle, high = ends
-    texts = [f"{m}, {name}: {b:.4g} ({a:.4g} to {c:.4g})" for m, (a, b, c) in zip(
-        members, ends.T, strict=True
-    )]  # fmt: skip
-    return go.Scatter(
-        x=middle, y=rows, mode="markers", marker={"color": colour, "size": 7}, name=name,
-        error_x={"type": "data", "symmetric": False, "array": high - middle,
-                 "arrayminus": middle - low, "thickness": 2.5, "width": 0},
-        text=texts, hovertemplate="%{text}<extra></extra>", legendgroup=name,
-    )  # fmt: skip
-
 
 _FORM = ".4g"
 _OMITTED = ("members", "alone")  # attributes that the page leaves out
@@ -197,11 +126,11 @@ def _members(
         misfit_sentences += [f"{member}: {sentence}" for sentence in misfits(tree)]
     labels = [label_of(population, name) for name in population.shared]
     return [
-        parts.chart(shrinkage(population)),
-        parts.note("Medians and 90 % of each member with the others, the chart's blue:"),
+        parts.picture(figure_of(population)),
+        parts.note("Medians and 90 % of each member with the others, the picture's blue:"),
         parts.table(("", *labels), numbers),
         parts.note(
-            "Each member by itself, the chart's grey: FEM's verdict, and how much of its data "
+            "Each member by itself, the picture's grey: FEM's verdict, and how much of its data "
             "lies within 90 % of what its posterior predicts, noise included. For a page: "
             f"calibrate report on {MEMBERS}/NAME in this folder, then on the folder again."
         ),

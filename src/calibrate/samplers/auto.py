@@ -6,6 +6,7 @@ batches, populations agree and the tail of the weights is light, and those of NU
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
@@ -46,6 +47,8 @@ class Auto(Sampler):
         draws = _by_importance(density, data, options, context)
         if isinstance(draws, Draws):
             return draws._replace(attributes={SAMPLED_BY: IMPORTANCE.name, **draws.attributes})
+        if context.progress:
+            print(f"sampled by {NUTS.name}: {draws}", file=sys.stderr, flush=True)
         why = {SAMPLED_BY: NUTS.name, NOT_BY_IMPORTANCE: draws}
         draws = NUTS.sample(density, data, _for(NUTS, options), context)
         return draws._replace(attributes={**why, **draws.attributes})

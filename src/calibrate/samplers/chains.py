@@ -16,10 +16,10 @@ Chains start at random points, within two units of the centre.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -40,7 +40,9 @@ from emulator.core.display import counting
 from emulator.core.errors import SolverError
 from emulator.core.kept import kept
 
-_CHUNK = 50  # iterations between two updates of the progress bar
+_CHUNK = 50  # iterations at most between two updates of the progress bar
+_SHOWN = 5.0  # seconds between them, where iterations are slow
+_MANY_STEPS = 200  # gradients of an iteration from which the progress bar names them
 _CANDIDATES = 16  # starting points tried, for forward maps that are not valid everywhere
 _PILOT, _FINAL = 0, 1  # runs
 _STARTS = 3  # draws of the prior from which a mode is searched
@@ -85,7 +87,7 @@ class Programs:
     Parameters
     ----------
     start : (key, data, map) -> state, its log density.
-    advance : (state, data, map, count) -> state, :class:`Draws`.
+    advance : (state, data, map, count) -> state, :class:`Draws` of which ``count`` rows count.
     """
 
     def __init__(
@@ -104,15 +106,14 @@ class Programs:
         self, states: States, data: Any, map_: StandardMap, count: int
     ) -> tuple[States, Draws]:
         """Return all chains' states after ``count`` iterations, and draws (c, count, ...)."""
-        advance = partial(self._advance, count=count)
-        results = self._for_all(f"advance {count}", advance, states, data, map_)
+        results = self._for_all("advance", self._advance, states, data, map_, jnp.array(count))
         states, draws = zip(*results, strict=True)
-        return states, jax.tree.map(lambda *chains: np.stack(chains), *draws)
+        return states, jax.tree.map(lambda *chains: np.stack(chains)[:, :count], *draws)
 
     def shapes(self, chains: int, data: Any, map_: StandardMap) -> tuple[States, Draws]:
         """Return structure, shapes and types of states and draws (c, 1, ...)."""
         state, _ = jax.eval_shape(self._start, jax.random.key(0), data, map_)
-        _, draws = jax.eval_shape(partial(self._advance, count=1), state, data, map_)
+        _, draws = jax.eval_shape(self._advance, state, data, map_, jnp.array(1))
         every = jax.tree.map(lambda x: jax.ShapeDtypeStruct((chains, *x.shape), x.dtype), draws)
         return (state,) * chains, every
 
@@ -150,12 +151,18 @@ def compile_chains(density: Target, sampler: ChainSampler, options: ChainOptions
         first = jnp.argmax(jnp.isfinite(heights))
         return kernel.init(kernel_key, candidates[first], data, map_), heights[first]
 
-    def advance(state: Any, data: Any, map_: StandardMap, count: int) -> Any:
-        def step(state: Any, _: None) -> Any:
+    def advance(state: Any, data: Any, map_: StandardMap, count: jax.Array) -> Any:
+        def step(state: Any) -> Any:
             state, w, statistics = kernel.step(state, data, map_)
             return state, Draws(apply_standard(map_, w), statistics)
 
-        return jax.lax.scan(step, state, length=count)
+        def iteration(k: jax.Array, carry: Any) -> Any:
+            state, row = step(carry[0])
+            return state, jax.tree.map(lambda rows, new: rows.at[k].set(new), carry[1], row)
+
+        _, row = jax.eval_shape(step, state)
+        rows = jax.tree.map(lambda x: jnp.zeros((_CHUNK, *x.shape), x.dtype), row)
+        return jax.lax.fori_loop(0, count, iteration, (state, rows))
 
     return Programs(start, advance, density.at_once)
 
@@ -187,12 +194,12 @@ class Chains:
         self.programs = compile_chains(density, sampler, options)
         self._warmup = options.warmup if sampler.adapts_in_steps else 0
         wanted = max(_PILOT_DRAWS, 10 * coefficient_count(density.dimension))
-        # In whole chunks: a part of one would be compiled on its own.
         self._pilot = min(options.draws, -(-wanted // (options.chains * _CHUNK)) * _CHUNK)
         self.map_ = standard_identity(density.dimension, bends=density.piloted)
         self.states: States = ()
         self._parts: list[Draws] = []
         self.run = self.warmed = self._count = 0
+        self._part = 1  # iterations until the next update, which no draw depends on
 
     def begin(self, rng_key: jax.Array) -> None:
         """Run the pilot, if the density wants one, and start the final run, or resume either."""
@@ -217,8 +224,14 @@ class Chains:
     def draw(self, total: int) -> Draws:
         """Return the first ``total`` draws of this run, after its warm-up."""
         while (warming := self.warmed < self._warmup) or self._count < total:
-            count = min(_CHUNK, self._warmup - self.warmed if warming else total - self._count)
+            count = min(self._part, self._warmup - self.warmed if warming else total - self._count)
+            start = time.perf_counter()
             self.states, draws = self.programs.advance(self.states, self.data, self.map_, count)
+            seconds = max(time.perf_counter() - start, 1e-9)
+            self._part = min(max(int(count * _SHOWN / seconds), 1), _CHUNK)
+            steps = float(np.mean(draws.statistics.get("n_steps", 0.0)))
+            if steps > _MANY_STEPS:
+                self.bar.set_postfix_str(f"{steps:.0f} gradients an iteration", refresh=False)
             if warming:
                 self.warmed += count
             else:

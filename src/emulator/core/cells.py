@@ -16,15 +16,20 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from emulator.core.errors import InputError
+from emulator.core.units import UNITS, with_unit
 
 TEXT = (".csv", ".tsv", ".txt")
 SPREADSHEETS = (".xlsx", ".xlsm")
+OTHER_SPREADSHEETS = (".xls", ".ods")
+"""Endings of spreadsheets that are not read."""
 PROTOCOL, BRANCH = "protocol", "branch"
 """Columns of the test that a row belongs to, and of whether it was loading."""
 UNLOADING = "unloading"
 """The word in the column ``branch`` of rows that are left out."""
+_DIMENSIONLESS = ("-", "1", "mm/mm")
+_THOUSANDS = re.compile(r"[-+]?\d{1,3}(,\d{3})+(\.\d*)?")
 _MARKED = re.compile(r"[-+]?\d+([.,])\d+")
-MISSING = ("", "na", "n/a", "nan")
+MISSING = ("", "na", "n/a", "nan", "#n/a", "-", "--")
 
 
 class Cells(NamedTuple):
@@ -57,6 +62,8 @@ class Cells(NamedTuple):
             return float(cell.replace(",", ".") if self.decimal_comma and "." not in cell else cell)
         except ValueError as error:
             fault = f"'{cell}', not a number" if cell else "empty"
+            if _THOUSANDS.fullmatch(cell):
+                fault += ": leave out marks of thousands"
             raise InputError(
                 f"data file {self.path}: row {row}, column '{word}' is {fault}"
             ) from error
@@ -70,6 +77,8 @@ def read_cells(path: Path) -> Cells:
     InputError
         A file that is none, two columns of one name, a row longer than the header, or no rows.
     """
+    if path.suffix.lower() in OTHER_SPREADSHEETS:
+        raise InputError(f"data file {path} is a spreadsheet; save it as CSV")
     sheets = path.suffix.lower() in SPREADSHEETS
     words, cells, decimal_comma = (_of_sheets if sheets else _of_text)(path)
     if words and all(map(_is_number, words)):
@@ -86,14 +95,22 @@ def read_cells(path: Path) -> Cells:
         if word and words.count(word) > 1:
             raise InputError(f"data file {path}: column '{word}' is there twice")
     rows: dict[int, dict[str, str]] = {}
+    names, units = words, _units_of(words, cells[0]) if cells else None
+    if units is not None:
+        words = [f"{w} [{unit}]" if unit else w for w, unit in zip(words, units, strict=True)]
     for number, row in enumerate(cells, 1):
+        if row[: len(names)] == names:
+            raise InputError(
+                f"data file {path}: row {number} has the names of columns again: give one table, "
+                f"in which a column '{PROTOCOL}' names each row's test"
+            )
         if any(row[len(words) :]):
             hint = "" if decimal_comma else "; decimal commas need semicolons between columns"
             raise InputError(
                 f"data file {path}: row {number} has {len(row)} values for {len(words)} "
                 f"columns{hint}"
             )
-        if any(row) or len(row) > 1:
+        if any(row) and (number > 1 or units is None):
             padded = row + [""] * (len(words) - len(row))
             rows[number] = dict(zip(words, padded, strict=False))
     if words and not rows:
@@ -108,6 +125,17 @@ def read_cells(path: Path) -> Cells:
             )
     _check_marks(path, rows, decimal_comma=decimal_comma)
     return Cells(path, words, rows, decimal_comma, every - len(rows))
+
+
+def _units_of(words: Sequence[str], row: Sequence[str]) -> list[str] | None:
+    """Return the unit of each column if the first row has units in place of numbers, else None."""
+    bare = [cell.strip("[]()") for cell in row[: len(words)]]
+    known = [text in UNITS or text != cell for cell, text in zip(row, bare, strict=False)]
+    if len(bare) < len(words) or not all(known) or any(map(_is_number, bare)) or not any(bare):
+        return None
+    if any(with_unit(word)[1] for word in words):
+        return None
+    return ["" if text in _DIMENSIONLESS else text for text in bare]
 
 
 def _check_marks(path: Path, rows: Mapping[int, Mapping[str, str]], *, decimal_comma: bool) -> None:

@@ -18,6 +18,7 @@ IN_KPA = {
     "kPa": 1.0, "Pa": 1e-3, "MPa": 1e3, "N/mm2": 1e3, "N/cm2": 10.0, "N/m2": 1e-3, "mN/mm2": 1.0,
     "mmHg": KPA_PER_MMHG, "psi": 6.894757, "kgf/cm2": 98.0665, "gf/cm2": 0.0980665,
     "g/cm2": 0.0980665, "bar": 100.0, "dyn/cm2": 1e-4,
+    "cmH2O": 0.0980665,
 }  # fmt: skip
 """Stresses and pressures."""
 IN_MN = {"mN": 1.0, "N": 1e3, "g": 9.80665, "gf": 9.80665, "kgf": 9806.65, "kN": 1e6}
@@ -28,6 +29,8 @@ IN_MM2 = {"mm2": 1.0, "cm2": 100.0, "m2": 1e6}
 """Areas."""
 IN_ML = {"mL": 1.0, "ml": 1.0, "cm3": 1.0, "mm3": 1e-3, "uL": 1e-3, "µL": 1e-3, "L": 1e3, "m3": 1e6}
 """Volumes."""
+UNITS = {*IN_KPA, *IN_MN, *IN_MM, *IN_MM2, *IN_ML, "%", "-", "mm/mm", "s", "min", ""}
+"""Names that a row of units may have."""
 
 
 def with_unit(word: str) -> tuple[str, str]:

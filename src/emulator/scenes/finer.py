@@ -11,12 +11,16 @@ import numpy as np
 from emulator.core.errors import InputError
 from emulator.geometry.fibres import across
 from emulator.geometry.refinement import Refinement, refined
+from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.fibre_rules import FibreRule
 from emulator.scenes.forward_problem import ForwardProblem
+from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import Scene, with_mesh
 
 FINER = "finer"
 """The name under which the origin of a scene says that its mesh was refined."""
+_AT_LIMIT = 0.02  # share of a range within which its end is at a limit
+_SHORT_OF = 0.999  # share of the way to a limit that a wider range may go
 WIDER = "wider"
 """The name under which the origin of a scene says that the ranges of its parameters are wider."""
 
@@ -103,9 +107,24 @@ def _is_made_by(rule: FibreRule, scene: Scene) -> bool:
     return fibres.shape == scene.fibres.shape and np.allclose(fibres, scene.fibres, atol=1e-9)
 
 
+def wider_within(parameter: Parameter, quantity: Quantity) -> Parameter:
+    """Return the parameter with a wider range that keeps off the limits of its values by nature.
+
+    An end near such a limit stays.
+    """
+    wide, near = parameter.wider(), _AT_LIMIT * (parameter.high - parameter.low)
+    below, above = parameter.low - quantity.low, quantity.high - parameter.high
+    stays = parameter.scale == "uniform" and below < near
+    return replace(
+        parameter,
+        low=parameter.low if stays else max(wide.low, parameter.low - _SHORT_OF * below),
+        high=parameter.high if above < near else min(wide.high, parameter.high + _SHORT_OF * above),
+    )
+
+
 def wider[P: ForwardProblem](scene: P) -> P:
     """Return ``scene`` with every parameter's range wider by half of it on each side."""
-    parameters = tuple(parameter.wider() for parameter in scene.parameters)
+    parameters = tuple(wider_within(p, scene.quantities[p.name]) for p in scene.parameters)
     origin = {"scene": WIDER, "of": dict(scene.origin)} if scene.origin else {}
     return cast(P, replace(cast(Any, scene), parameters=parameters, origin=origin))
 

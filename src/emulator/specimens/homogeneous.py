@@ -287,9 +287,11 @@ HOMOGENEOUS = ForwardKind(
     "homogeneous",
     "states of a specimen, without a mesh",
     lambda ingredients, _: homogeneous(require_specimen(ingredients.scene)),
+    closer="",
 )
 INCOMPRESSIBLE = ForwardKind(
     "incompressible",
     "the same, without changes of volume",
     lambda ingredients, _: homogeneous(require_specimen(ingredients.scene), incompressible=True),
+    closer="--forward homogeneous",
 )

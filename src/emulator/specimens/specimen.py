@@ -38,7 +38,24 @@ from emulator.specimens.states import States, motion_columns, pull_columns, stat
 from emulator.specimens.tube import Tube
 from emulator.specimens.tube import motion_columns as tube_columns
 
-_CONVENTION = re.compile(r"(lambda|λ|sigma|σ)_?([xyzXYZ]{1,2})")
+_CONVENTIONS = (
+    (r"(?:lambda|λ|stretch)_?([xyz])\1?", r"stretch_\1"),
+    (r"(?:e|green)_?([xyz])\1", r"green_\1"),
+    (r"(?:eps|epsilon|ε|strain)_?([xyz])\1?", r"strain_\1"),
+    (r"(?:gamma|γ|shear)_?([xyz][xyz])", r"shear_\1"),
+    (r"(?:sigma|σ|cauchy)_?([xyz])\1?", r"cauchy_\1"),
+    (r"(?:p|pk1|stress)_?([xyz])\1?", r"stress_\1"),
+    (r"(?:s|pk2)_?([xyz])\1", r"second_\1"),
+    (r"axial_(stretch|force)", r"\1_axial"),
+    (r"((?:inner|outer)_(?:radius|diameter)|stretch_axial|pressure)", r"\1"),
+)
+"""Names of columns by other conventions, in small letters with _ for blanks, and ours for each."""
+_MACHINES = {
+    r"(extension|displacement|elongation|crosshead).*": "over the length at rest is strain_x [-]",
+    r"(load|force)(_.*)?": "is force_x, beside a column area_x [mm2]",
+    r"(log|true|hencky)_?strain.*": "is the logarithm of stretch_x",
+}
+"""What columns of testing machines are."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -209,9 +226,10 @@ def read_states(table: Path | Cells, tube: Tube | None = None) -> States:
             "to: calibrate init --tube, or [tube] in the scene file"
         )
     if not words:
+        usual = "stretch_x, strain_x or shear_xy" if tube is None else "outer_radius, stretch_axial"
         raise InputError(
-            f"data file {path}: no column says how the specimen moves: stretch_x, strain_x or "
-            f"shear_xy{_likely(cells.words)}; it has {', '.join(filter(None, cells.words))}"
+            f"data file {path}: no column says how the specimen moves: {usual}"
+            f"{_likely(cells.words)}; it has {', '.join(filter(None, cells.words))}"
         )
     columns = {w: np.array([cells.number(k, w, gaps=True) for k in rows]) for w in words}
     names = [cells.rows[k][PROTOCOL] for k in rows] if PROTOCOL in cells.words else None
@@ -221,16 +239,21 @@ def read_states(table: Path | Cells, tube: Tube | None = None) -> States:
             raise InputError(f"row {row}, column '{PROTOCOL}' is empty; name the row's test")
         return states_in(columns, names, tube=tube)
     except InputError as error:
-        raise InputError(f"data file {path}: {error}") from error
+        # States count their rows from 1; in the file others may be between them.
+        text = re.sub(r"\brow (\d+)", lambda m: f"row {rows[int(m[1]) - 1]}", str(error))
+        raise InputError(f"data file {path}: {text}") from error
 
 
 def _likely(words: Sequence[str]) -> str:
     """Suggest names for columns that follow other conventions."""
-    renamed = []
+    renamed, described = [], []
     for word in words:
         name, unit = with_unit(word)
-        match = _CONVENTION.fullmatch(name)
-        if match is not None:
-            quantity = "stretch" if match[1] in ("lambda", "λ") else "cauchy"
-            renamed.append(f"{word} {quantity}_{match[2][0].lower()}{f' [{unit}]' if unit else ''}")
-    return f"; call {', '.join(renamed)} if they are that" if renamed else ""
+        plain = name.lower().replace(" ", "_")
+        matches = ((re.fullmatch(pattern, plain), ours) for pattern, ours in _CONVENTIONS)
+        ours = next((match.expand(ours) for match, ours in matches if match is not None), name)
+        if ours != name:
+            renamed.append(f"{word} {ours}{f' [{unit}]' if unit else ''}")
+        described += [f"{word} {of}" for form, of in _MACHINES.items() if re.fullmatch(form, plain)]
+    calls = f"; call {', '.join(renamed)} if they are that" if renamed else ""
+    return "; ".join([calls, *described])

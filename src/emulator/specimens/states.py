@@ -29,7 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emulator.core.cells import PROTOCOL
+from emulator.core.cells import BRANCH, PROTOCOL, UNLOADING
 from emulator.core.errors import InputError
 from emulator.core.units import IN_KPA, factor, with_unit
 
@@ -42,6 +42,7 @@ _MOST_SHEAR = 5.0
 _UNDOUBTED = 1.0  # strain or shear above which a column has to say that it is not in percent
 _BACK = 0.02  # share of a test's largest motion or pull by which measured ones may go back
 _NOISE, _MOST_BACK = 5.0, 0.1  # sds of noise by which they may go back, and share at most
+_STILL, _FEWEST_HELD = 0.002, 3  # share of the largest motion, and rows, of a hold
 _FEWEST_NOISY = 8  # rows of a test that show its noise
 _SD_OF_SECOND_DIFFERENCE = 0.6745 * np.sqrt(6.0)  # median of its size, over the noise's sd
 
@@ -75,6 +76,21 @@ class States(NamedTuple):
             steps += np.linalg.norm(np.diff(self.pulls[rows], axis=0), axis=1) / largest
             lengths[rows[1:]] = np.cumsum(steps)
         return lengths
+
+    def holds(self) -> list[np.ndarray]:
+        """Return the rows (k,) of each state that a test stays in for some rows."""
+        runs = []
+        for rows in self.protocols.values():
+            motion = np.hstack([self.gradients[rows].reshape(-1, 9), self.pulls[rows]])
+            motion /= np.abs(motion).max(axis=0) + np.finfo(float).tiny
+            start = 0
+            for end in range(1, len(rows) + 1):
+                if end < len(rows) and np.abs(motion[end] - motion[start]).max() < _STILL:
+                    continue
+                if end - start >= _FEWEST_HELD:
+                    runs.append(rows[start:end])
+                start = end
+        return runs
 
 
 def motion_columns(words: Collection[str]) -> list[str]:
@@ -187,7 +203,10 @@ def _check_unit(word: str, measure: str | None, unit: str, values: np.ndarray) -
 def _component(word: str, measure: str | None, unit: str, values: np.ndarray) -> np.ndarray:
     """Return the component of H that a column gives, NaN where it is free."""
     if unit not in ("", "1", "-", "%", "mm/mm") or (unit == "%" and measure == "stretch"):
-        raise InputError(f"column '{word}': unit '{unit}'; a stretch has none, a strain none or %")
+        hint = "; a shear is the tangent of its angle" if unit in ("deg", "°", "rad") else ""
+        raise InputError(
+            f"column '{word}': unit '{unit}'; a stretch has none, a strain none or %{hint}"
+        )
     values = 0.01 * values if unit == "%" else values
     if measure is None:
         return np.where(np.isnan(values), 0.0, values)
@@ -248,10 +267,21 @@ def _check_path(
             f"the rows{test} go through rest, from one side to the other: name the rows of either "
             f"side as a test of its own in a column '{PROTOCOL}', each from rest"
         )
-    raise InputError(
-        f"row {rows[back[0]] + 1}{test} is nearer to rest than one before: unloading "
-        "goes under 'unloading' in a column 'branch', another test under another name in a "
-        f"column '{PROTOCOL}'"
+    reversible = not (falls(away[::-1]) | falls(pull[::-1])).any()
+    raise going_back(f"row {rows[back[0]] + 1}{test} is nearer to rest", reversible=reversible)
+
+
+def going_back(what: str, *, reversible: bool) -> InputError:
+    """Return the refusal of a test that goes back; ``reversible``: not if read from its end."""
+    if reversible:
+        return InputError(
+            f"{what} than one before, and so is each further one: reverse the rows of a test that "
+            "was recorded while it unloads"
+        )
+    return InputError(
+        f"{what} than one before: rows of a test are in the order of its loading, unloading goes "
+        f"under '{UNLOADING}' in a column '{BRANCH}', another test under another name in a column "
+        f"'{PROTOCOL}'"
     )
 
 

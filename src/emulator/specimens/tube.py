@@ -38,7 +38,7 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.core.units import IN_MM, factor, with_unit
-from emulator.specimens.states import STRETCHES, States, falls, rows_of
+from emulator.specimens.states import STRETCHES, States, falls, going_back, rows_of
 
 _RADIUS = re.compile(r"(inner|outer)_(radius|diameter)")
 _AXIAL = "stretch_axial"
@@ -224,10 +224,9 @@ def _check_path(inner: np.ndarray, axial: np.ndarray, rows: np.ndarray, name: st
     back = np.flatnonzero(falls(way) & (axial <= axial[_largest_before(way)]))
     if len(back):
         test = f" of '{name}'" if name else ""
-        raise InputError(
-            f"row {rows[back[0]] + 1}{test} has a smaller radius than one before: "
-            "deflation goes under 'unloading' in a column 'branch', another test under another "
-            "name in a column 'protocol'"
+        raise going_back(
+            f"row {rows[back[0]] + 1}{test} has a smaller radius",
+            reversible=not falls(way[::-1]).any(),
         )
 
 

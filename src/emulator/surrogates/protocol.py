@@ -168,6 +168,7 @@ class ForwardKind:
         because a second fit may give another map; they are kept with results. ``from_arrays``
         raises ``KeyError`` where one is missing. ``None`` for a kind that is not fitted.
     words : the further words that have an effect: ``emulator`` where one is an ingredient.
+    closer : words on the map to take where this one is too far from FEM; none for an exact one.
     """
 
     name: str
@@ -177,3 +178,4 @@ class ForwardKind:
     to_arrays: Callable[[ForwardMap], Arrays] | None = None
     from_arrays: Callable[[Any, Arrays], ForwardMap] | None = None
     words: tuple[str, ...] = ()
+    closer: str = "--forward corrected (or more of its --steps)"

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import emulator as em
+from calibrate.cli import main
 from calibrate.measurements.data import read_measurements
 from cli_support import answer, complaint
 from emulator.geometry.generators.box import box
@@ -53,6 +54,8 @@ def test_what_is_written_is_read_as_data_of_states(folder, capsys):
     code, said = answer(capsys, *words, "--out", "field.csv")
     assert code == 0
     assert said["data"]["displacement@9"]["missing"] == 6 + 2  # out of the plane, and one point
+    assert main(["frames", *words[1:], "--out", "again.csv"]) == 0
+    assert 'kind "gain"' in capsys.readouterr().out  # moduli are as uncertain as the thickness
     scene = em.find_scene("sheet.toml")
     observe, data, known = read_measurements(scene, "field.csv")
     assert known == {"pull@5": 1.0, "pull@9": 2.0}  # the frame at rest is none

@@ -9,7 +9,8 @@ import pytest
 import emulator as em
 from calibrate.cli import main
 from calibrate.cli.commands.emulators import prediction_summary
-from calibrate.cli.output import volume_lines, volumes
+from calibrate.cli.output import volume_lines
+from emulator.fem.outcome import cavity_volumes
 from emulator.geometry.facets import Cavity
 
 CENTRE = ("mu=75", "lam=60")
@@ -78,13 +79,13 @@ def test_cavities():
     u = jnp.zeros(scene.held.shape)
     cavity = Cavity(scene.mesh, "endocardium")
     volume = float(cavity(u[cavity.nodes]))
-    assert volumes(scene, u) == {
+    assert cavity_volumes(scene, u) == {
         "endocardium": {
             "rest_ml": pytest.approx(volume), "volume_ml": pytest.approx(volume), "error_ml": None
         }
     }  # fmt: skip
     estimate = SimpleNamespace(valid=True, of=lambda quantity: quantity(u) - volume + 2.0)
-    found = volumes(scene, u, estimate)
+    found = cavity_volumes(scene, u, estimate.of)
     assert found["endocardium"]["error_ml"] == pytest.approx(2.0)
     (line,) = volume_lines(found)
     assert line == f"cavity 'endocardium': {volume:.6g} mL, at rest {volume:.6g} mL, error +2 mL"

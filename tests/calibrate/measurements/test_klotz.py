@@ -126,7 +126,10 @@ def test_one_measured_volume_in_two_more_states(ventricle, tmp_path):
         (lambda s: cal.Klotz(0.0, 1.3), "the measured volume is 0.0 mL; it must be above 0"),
         (lambda s: cal.Klotz(120.0, 10.0), r"is 10.0 kPa; it must .* 5.33 kPa \(40 mmHg; 1 mmHg"),
         (lambda s: cal.Klotz(120.0, float("nan")), "the measured pressure is nan kPa"),
-        (lambda s: parse_observation(s, "klotz"), "observe 'klotz': give klotz:PRESSURE"),
+        (
+            lambda s: parse_observation(s, "klotz"),
+            "observe 'klotz': give klotz:MEASUREDPRESSURE in kPa",
+        ),
         (lambda s: parse_observation(s, "klotz:high"), "such as klotz:1.3"),
         (lambda s: parse_observation(s, "klotz:-1"), "klotz:-1.0: the measured pressure is -1.0"),
         (

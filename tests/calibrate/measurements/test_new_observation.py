@@ -25,7 +25,6 @@ class Area(Scalar):
     points: np.ndarray
 
     kind = "area"
-    usage = "area:NODE,NODE,NODE"
     quantity = "area"
     unit = "mm2"
     usual_sd = 0.1
@@ -99,7 +98,7 @@ def test_in_a_run(beam):
     assert run.named(observe).noise == {"area:3,14,20": 0.3}
     assert Run("once_clamped_beam").named(observe).noise == {"area:3,14,20": 0.1}
     assert data["area:3,14,20"].shape == ()
-    with pytest.raises(InputError, match="observe 'areas': give nodes:N.*area:NODE,NODE,NODE"):
+    with pytest.raises(InputError, match="observe 'areas': give nodes:N.*area:CORNER,..."):
         parse_observation(beam, "areas")
-    with pytest.raises(InputError, match="observe 'area:3,x': give area:NODE,NODE,NODE"):
+    with pytest.raises(InputError, match="observe 'area:3,x': give area:CORNER,..."):
         parse_observation(beam, "area:3,x")

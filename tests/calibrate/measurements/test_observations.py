@@ -1,5 +1,4 @@
 import json
-import re
 from pathlib import Path
 
 import jax
@@ -15,7 +14,7 @@ from calibrate.measurements import (
     spread_landmarks,
     spread_nodes,
 )
-from calibrate.noise import NOISES
+from calibrate.noise import NOISES, usage_of
 from emulator.core.errors import InputError
 
 NO_THETA = jnp.zeros(0)
@@ -191,5 +190,6 @@ def test_the_guide_names_every_kind():
     text = (Path(__file__).parents[3] / "docs" / "observations.md").read_text(encoding="utf-8")
     for kind in (*OBSERVATIONS.values(), *NOISES.values()):
         assert f"`{kind.kind}" in text, kind.kind
-        for option in re.findall(r"(\w+)=", kind.usage):
+    for kind in NOISES.values():
+        for option in usage_of(kind).partition(" of ")[2].split(", "):
             assert f"`{option}`" in text, option

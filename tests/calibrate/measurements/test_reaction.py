@@ -95,7 +95,7 @@ def test_from_words_to_files_and_back(simulator, tmp_path):
 @pytest.mark.parametrize(
     ("word", "said"),
     [
-        ("reaction:top", "give reaction:SUPPORT:AXIS, such as reaction:top:x"),
+        ("reaction:top", "give reaction:SUPPORT:DIRECTION, such as reaction:top:x"),
         ("reaction:side:x", "no support on 'side'; it has bottom, top"),
         ("reaction:top:up", "direction 'up' of a reaction; give x, y, z or three numbers"),
         ("reaction:top:0,0,0", "give 3 numbers, not all 0"),

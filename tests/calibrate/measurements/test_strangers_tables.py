@@ -63,9 +63,8 @@ def test_a_strain_of_more_than_one_says_whether_it_is_in_percent(tmp_path):
     strain = np.linspace(0.0, 3.8, 30)
     told = refusal(tmp_path, "strain_x,stress_x", strain, strain)
     assert "'strain_x [%]' if it is in percent, 'strain_x [-]' if it is not" in told
-    assert "stress reaches" in " ".join(
-        draft(tmp_path, "strain_x [-],stress_x", strain, strain).notes
-    )
+    notes = draft(tmp_path, "strain_x [-],stress_x", strain, strain).notes
+    assert {"stretch_x from 1 to 4.8", "stress reaches 3.8 kPa"} < set(notes)
     reached = [read_states(table(tmp_path / "u.csv", f"strain_x [{unit}],stress_x", strain, strain))
                .gradients[-1, 0, 0] for unit in ("%", "-")]  # fmt: skip
     np.testing.assert_allclose(reached, [0.038, 3.8])
@@ -121,8 +120,59 @@ def test_what_goes_through_rest_or_only_unloads_is_named(tmp_path):
 def test_columns_of_another_convention_are_named(tmp_path):
     told = refusal(tmp_path, "lambda_x,sigma_xx [MPa]", STRETCH, STRESS)
     assert "call lambda_x stretch_x, sigma_xx [MPa] cauchy_x [MPa]" in told
-    told = refusal(tmp_path, "elongation,load", STRETCH, STRESS)
-    assert "it has elongation, load" in told
+    told = refusal(tmp_path, "Elongation (mm),Load (N)", STRETCH, STRESS)
+    assert "Elongation (mm) over the length at rest is strain_x [-]" in told
+    assert "it has Elongation (mm), Load (N)" in told
+    told = refusal(tmp_path, "E_xx,S_xx (MPa),log strain", STRETCH - 1.0, STRESS, STRETCH - 1.0)
+    assert "call E_xx green_x, S_xx (MPa) second_x [MPa] if they are that; log strain is" in told
+    words = "Outer Diameter (µm),Axial stretch,Pressure (mmHg)"
+    told = refusal(tmp_path, words, STRETCH, STRETCH, STRESS, tube=Tube(0.4, (0.1,)))
+    assert "call Outer Diameter (µm) outer_diameter [µm], Axial stretch stretch_axial" in told
+
+
+def test_a_row_of_units_is_read_and_rows_that_are_no_data_are_refused_or_left_out(tmp_path):
+    rows = [f"{a},{b}" for a, b in zip(STRETCH, 1e-3 * STRESS, strict=True)]
+    text = "\n".join(["stretch_x,stress_x", "(mm/mm),(MPa)", *rows[:9], ",", *rows[9:], ""])
+    (tmp_path / "t.csv").write_text(text)
+    draft_specimen(tmp_path / "t.csv", tmp_path / "x.toml")
+    _, data, _ = read_measurements(read_scene(tmp_path / "x_scene.toml"), tmp_path / "t.csv")
+    np.testing.assert_allclose(data["stress"].ravel(), STRESS, rtol=1e-9)
+    # Rows are counted as in the file, from 1 below the header.
+    (tmp_path / "t.csv").write_text(text + rows[3] + "\n")
+    with pytest.raises(InputError, match=r"row 33 is nearer to rest than one before: rows of"):
+        read_states(tmp_path / "t.csv")
+    (tmp_path / "t.csv").write_text(text + "stretch_x,stress_x\n" + rows[0] + "\n")
+    with pytest.raises(InputError, match="row 33 has the names of columns again"):
+        read_states(tmp_path / "t.csv")
+
+
+def test_missing_is_a_dash_too_and_marks_of_thousands_are_named(tmp_path):
+    assert (
+        "30 states" in draft(tmp_path, "stretch_x,stress_x", STRETCH, ["-", *STRESS[1:]]).notes[0]
+    )
+    (tmp_path / "t.csv").write_text('stretch_x,stress_x [Pa]\n1,0\n1.1,"1,185"\n')
+    with pytest.raises(InputError, match="'1,185', not a number: leave out marks of thousands"):
+        draft_specimen(tmp_path / "t.csv", tmp_path / "y.toml")
+    (tmp_path / "t.xls").write_text("")
+    with pytest.raises(InputError, match="is a spreadsheet; save it as CSV"):
+        draft_specimen(tmp_path / "t.xls", tmp_path / "y.toml")
+
+
+def test_a_hold_is_said_and_a_test_from_its_end_is_reversed(tmp_path):
+    stretch = np.concatenate([STRETCH, np.full(9, STRETCH[-1])])
+    stress = np.concatenate([STRESS, STRESS[-1] * np.linspace(0.97, 0.7, 9)])
+    (hold,) = [
+        n for n in draft(tmp_path, "stretch_x,stress_x", stretch, stress).notes if "hold" in n
+    ]
+    assert hold.startswith("CHANGE: rows 30 to 39 hold one state, in which stress goes from")
+    for file in tmp_path.glob("*.toml"):
+        file.unlink()
+    told = refusal(tmp_path, "stretch_x,stress_x", STRETCH[::-1], STRESS[::-1])
+    assert "reverse the rows of a test that was recorded while it unloads" in told
+    tube = Tube(0.36, (0.1,))
+    radius, words = 0.4 + 0.2 * (STRETCH - 1.0), "inner_radius,stretch_axial,pressure"
+    told = refusal(tmp_path, words, radius[::-1], np.full(30, 1.2), STRESS[::-1], tube=tube)
+    assert "reverse the rows" in told
 
 
 @pytest.mark.parametrize(

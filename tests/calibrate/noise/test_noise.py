@@ -182,14 +182,20 @@ def test_noise_of_a_run_in_words_and_json():
             "'rbf' is unknown; known",
         ),
         (lambda: CorrelatedNoise(1.0, 1.0, spatial_sd=1.0).at(None), "has no place of its own"),
-        (lambda: parse_noise("loud"), "'loud' is neither a number nor a noise; give gaussian:sd"),
+        (
+            lambda: parse_noise("loud"),
+            "'loud' is neither a number nor a noise; give gaussian:OPTION=VALUE",
+        ),
         (lambda: parse_noise("student_t:scale=1"), "noise 'student_t': key 'dof' is missing"),
         (
             lambda: parse_noise("student_t:dof=4,sd=1"),
             "noise 'student_t': unknown key 'sd'; known: dof, prior_scale, scale",
         ),
         (lambda: parse_noise("student_t:dof=few,scale=1"), 'dof = "few"; expected a number'),
-        (lambda: parse_noise("student_t:dof"), "'dof' is not option=value; give student_t:dof=DOF"),
+        (
+            lambda: parse_noise("student_t:dof"),
+            "'dof' is not option=value; give student_t:OPTION=VALUE,... of dof, scale",
+        ),
     ],
 )
 def test_one_line_for_every_mistake(make, message):

@@ -8,8 +8,11 @@ import calibrate as cal
 from calibrate.posterior.box import box_ends, in_words
 from calibrate.posterior.diagnosis import diagnose
 from calibrate.project.run import with_absolute_paths
-from emulator.catalogue import find_scene, scene_from_origin
+from calibrate.project.specimen import draft_specimen
+from emulator.catalogue import find_problem, find_scene, scene_from_origin
 from emulator.core.errors import InputError
+from emulator.mechanics.laws.law import Quantity
+from emulator.scenes.finer import wider_within
 from emulator.scenes.parameter_space import Parameter
 from linear_support import linear_forward
 
@@ -201,3 +204,25 @@ def test_a_mode_that_is_cut_ends_there_beside_one_that_is_not():
     cut = 1.0 + np.abs(0.02 * rng.normal(size=2000))
     (end,) = box_ends({"a": np.concatenate([cut, 1.2 + 0.02 * rng.normal(size=2000)])}, box)
     assert (end.name, end.value) == ("a", 1.0)
+
+
+def test_an_end_at_a_limit_of_nature_ends_no_posterior(tmp_path):
+    """A dispersion of fibres is 1/3 at most, and ``init`` writes a range up to 0.33."""
+    table = "stretch_x,stretch_y,stress_x,stress_y\n1,1,0,0\n1.1,1.1,5,4\n1.2,1.2,30,20\n"
+    (tmp_path / "t.csv").write_text(table)
+    scene = draft_specimen(
+        tmp_path / "t.csv", tmp_path / "x.toml", law="gasser_ogden_holzapfel"
+    ).scene
+    (parameter,) = (p for p in scene.parameters if p.name == "dispersion")
+    quantity = scene.quantities["dispersion"]
+    draws = {"dispersion": parameter.high - 0.03 * np.abs(RNG(0).normal(size=4000))}
+    box = {"dispersion": parameter}
+    assert box_ends(draws, box, {"dispersion": quantity}) == []
+    assert box_ends(draws, box) != []
+    wider = find_problem(f"wider:{tmp_path / 'x_scene.toml'}")
+    (after,) = (p for p in wider.parameters if p.name == "dispersion")
+    assert (after.low, after.high) == (parameter.low, parameter.high)
+    poisson = Quantity("nu", low=-1.0, high=0.5)
+    assert wider_within(Parameter("nu", "", 0.1, 0.4, "log"), poisson).high == pytest.approx(0.4999)
+    middle = Parameter("k", "", 1.0, 2.0)
+    assert wider_within(middle, Quantity("k")) == middle.wider() == Parameter("k", "", 0.5, 2.5)

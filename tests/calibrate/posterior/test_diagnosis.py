@@ -77,6 +77,12 @@ def test_a_wrong_map_comes_first_and_chains_on_it_are_not_blamed_on_the_sampler(
     assert "--error-runs N" in first
     assert chains == "the chains disagree about mu, R-hat 1.500: mend the map first"
     assert "more draws" not in few
+    # A specimen's maps are exact, so there is nothing to correct but the law's finite kappa.
+    for kind, remedy in (("incompressible", "infer with --forward homogeneous, or let the map's"),
+                         ("homogeneous", "at the draws: let the map's error widen")):  # fmt: skip
+        (sentence,) = said(attributes=errors | {"forward": kind})
+        assert remedy in sentence
+        assert "corrected" not in sentence
     small = {MAP_ERRORS: json.dumps({"volume": 0.4})}
     assert said(attributes=small) == []
     assert said(attributes=small | {MAP_MOVES: 0.4}) == []

@@ -10,11 +10,11 @@ import pytest
 import calibrate as cal
 import emulator as em
 from calibrate.cli import main
+from calibrate.figures.shrinkage import figure_of
 from calibrate.measurements.data import write_data
 from calibrate.posterior import read_tree
 from calibrate.project import holds_population
 from calibrate.project.members import read_members
-from calibrate.report.population import shrinkage
 from cli_support import answer, complaint
 from emulator.scenes.built_in import BUILT_IN
 
@@ -185,7 +185,7 @@ def test_the_page_of_a_population(copy, capsys):
     measured = np.asarray(tree["observed_data"]["displacement"])
     share = 100.0 * np.mean((measured >= ends[0]) & (measured <= ends[1]))
     assert f"<td>stiff</td><td>not certified</td><td>{share:.0f} % of 12</td><td></td>" in body
-    assert re.findall('href="([^"]*)"', body) == ["members/soft/report.html"]
+    assert re.findall('<a href="([^"]*)"', body) == ["members/soft/report.html"]
     assert "infer_members(members, " in body
     assert str(copy) not in body
 
@@ -204,16 +204,17 @@ def test_the_page_elsewhere_links_back(copy, tmp_path):
 
 def test_the_chart_shows_members_and_one_not_seen(result):
     _, found = read_members(result)
-    band, middle, alone, together = shrinkage(found).data
+    axes = figure_of(found).axes[0]
     low, median, high = np.quantile(found.new_member()["mu"], [0.05, 0.5, 0.95])
-    np.testing.assert_allclose(band.x, [low, high, high, low])
-    np.testing.assert_allclose(middle.x, [median, median])
+    (band,), (middle, *dots) = axes.patches, axes.lines
+    np.testing.assert_allclose([band.get_x(), band.get_x() + band.get_width()], [low, high])
+    np.testing.assert_allclose(middle.get_xdata(), median)
     draws = np.stack([found.member(name)["mu"] for name in TRUTHS])
     low, median, high = np.quantile(draws, [0.05, 0.5, 0.95], axis=1)
-    np.testing.assert_allclose(together.x, median)
-    np.testing.assert_allclose(together.error_x.array, high - median)
-    np.testing.assert_allclose(together.error_x.arrayminus, median - low)
-    assert (np.asarray(alone.y) < np.asarray(together.y)).all()
+    alone, together = (lines.get_segments() for lines in axes.collections)
+    np.testing.assert_allclose([ends[:, 0] for ends in together], np.stack([low, high], axis=1))
+    np.testing.assert_allclose(dots[1].get_xdata(), median)
+    assert all(a[0, 1] < b[0, 1] for a, b in zip(alone, together, strict=True))
 
 
 def test_members_are_not_one_run(folder):

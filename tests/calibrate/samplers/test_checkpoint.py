@@ -30,6 +30,8 @@ def kill_after(monkeypatch, writes):
             raise Killed
 
     monkeypatch.setattr(Checkpoint, "keep", kept)
+    # Opportunities come by the clock; here a first iteration, then fifty at a time.
+    monkeypatch.setattr("calibrate.samplers.chains._SHOWN", 1e9)
     return written
 
 
@@ -89,6 +91,21 @@ def test_a_run_does_go_on_and_does_not_begin_again(problem, monkeypatch, tmp_pat
     arrays["draws/statistics/lp"][0, 3] = -1234.5
     save_arrays(path, arrays, metadata)
     assert run(problem, "nuts", checkpoint=path).tree["sample_stats"]["lp"].values[0, 3] == -1234.5
+
+
+def test_slow_iterations_are_shown_and_kept_one_by_one(problem, monkeypatch, tmp_path, capsys):
+    """Draws do not depend on it, and long trajectories are named."""
+    whole = run(problem, "nuts")
+    written = kill_after(monkeypatch, None)
+    for name, value in (("chains._SHOWN", 0.0), ("chains._MANY_STEPS", 0)):
+        monkeypatch.setattr(f"calibrate.samplers.{name}", value)
+    monkeypatch.setattr("emulator.core.display.EVERY", 1e-3)
+    slow = run(problem, "nuts", checkpoint=tmp_path / "sampling.safetensors", progress=True)
+    draws = slow.tree["posterior"].sizes["draw"]
+    assert len(written) == 60 + 120 + 60 + draws  # a pilot and the final run, each with its warm-up
+    assert "gradients an iteration" in capsys.readouterr().err
+    for variable, values in whole.tree["posterior"].data_vars.items():
+        np.testing.assert_array_equal(slow.tree["posterior"][variable].values, values.values)
 
 
 @pytest.mark.parametrize(

@@ -184,7 +184,9 @@ def test_the_same_seed_gives_the_same_draws_whatever_the_threads(beam):
     assert not np.array_equal(one, other)
 
 
-def test_nuts_is_taken_where_importance_sampling_does_not_work(beam, simulator, monkeypatch):
+def test_nuts_is_taken_where_importance_sampling_does_not_work(
+    beam, simulator, monkeypatch, capsys
+):
     """Where its evaluations do not suffice, its weights are heavy, or the map is not fast."""
     model, data = linear_problem(beam)
     short = AutoOptions(200, 200, rounds=1)
@@ -201,8 +203,9 @@ def test_nuts_is_taken_where_importance_sampling_does_not_work(beam, simulator, 
     assert len(asked) == 1
     assert not density_of.__wrapped__(replace(model, forward=fem_forward(simulator))).batches
     of = replace(density_of(model.given(data)[0]), batches=False)
-    draws = AUTO.sample(of, model.given(data)[1], short, Context())
+    draws = AUTO.sample(of, model.given(data)[1], short, Context(progress=True))
     assert draws.attributes[NOT_BY_IMPORTANCE] == "the forward map solves FEM"
+    assert "sampled by nuts: the forward map solves FEM" in capsys.readouterr().err
     assert len(asked) == 1
 
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import sys
 from argparse import Namespace
-from dataclasses import asdict
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict, replace
+from typing import TYPE_CHECKING
 
 from calibrate.cli import words
 from calibrate.cli.output import table
@@ -19,7 +18,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from calibrate.analysis.effects import Recommendation
-    from emulator.scenes.scene import Scene
 
 
 @command(run_options("seed"), help="of data not yet measured, from a scene")
@@ -28,15 +26,21 @@ def _before(arguments: Namespace) -> Answer:
     from calibrate.analysis.expected import expected_precision
     from calibrate.analysis.identifiability import products_in_words
     from calibrate.cli.run_words import problem_of
+    from calibrate.noise import typical
     from calibrate.project import model_before_data
 
     problem = problem_of(arguments)
     # Errors that many numbers share are made for each data set, not at one draw of the prior.
     model = model_before_data(problem.change(systematic={}))
+    inferred = [name for name, noise in model.noise.items() if noise.priors]
+    noise = {name: typical(noise) for name, noise in model.noise.items()}
+    model = replace(model, noise=noise)
     expected = expected_precision(model, systematic=problem.run.systematic)
     rows = [(name, f"{100 * ratio:.3g} %") for name, ratio in expected["sd"].items()]
     lines = [table(("parameter", "expected sd / prior sd"), rows)]
     lines += products_in_words(expected["combinations"], len(rows))
+    if inferred:
+        lines.append(f"noise of {', '.join(inferred)}: inferred sds at the median of their prior")
     return Answer(expected, "\n".join(lines))
 
 
@@ -271,7 +275,7 @@ _COLUMNS = {
 )
 def sensitivity(arguments: Namespace) -> Answer:
     """Analyse a scene's forward map, and write the indices."""
-    from calibrate.analysis.sensitivity import sensitivity
+    from calibrate.analysis.sensitivity import indices_to_json, sensitivity
     from calibrate.measurements import parse_observation
     from calibrate.priors import prior_of
     from calibrate.project.run import with_absolute_paths
@@ -300,34 +304,10 @@ def sensitivity(arguments: Namespace) -> Answer:
         seed=arguments.seed,
     )
     if arguments.out:
-        _write_indices(indices, scene, Path(arguments.out))
-    result: dict[str, Any] = {str(name): value for name, value in indices.attrs.items()}
-    result |= {name: _plain(node.to_dataset()) for name, node in indices.children.items()}
-    return Answer(result, _indices_in_words(indices))
+        from calibrate.figures.sensitivity import write
 
-
-def _write_indices(indices: xr.DataTree, scene: Scene, folder: Path) -> None:
-    """Write the indices as netCDF, their figures, and indices of the nodes as VTU."""
-    import numpy as np
-
-    from calibrate.analysis.sensitivity import FIELD
-    from calibrate.figures.sensitivity import draw
-    from emulator.core.store import write_netcdf
-    from emulator.geometry.io import write_vtu
-
-    write_netcdf(folder / "sensitivity.nc", indices)
-    draw(indices, scene, folder)
-    if FIELD in indices.children:
-        data = indices[FIELD].to_dataset()
-        nodal = {
-            f"{name} {label}": np.nan_to_num(values)
-            for name in ("first", "total", "mu_star", "bound_on_total")
-            if name in data
-            for label, values in zip(
-                data[data[name].dims[0]].values, data[name].values, strict=True
-            )
-        }
-        write_vtu(folder / "sensitivity.vtu", scene.mesh, point_data=nodal)
+        write(indices, scene, arguments.out)
+    return Answer(indices_to_json(indices), _indices_in_words(indices))
 
 
 def _indices_in_words(indices: xr.DataTree) -> str:
@@ -362,16 +342,6 @@ def _active(data: xr.Dataset) -> str:
     )
     share = 100.0 * values[0] / values.sum()
     return f"{share:.0f} % of the squared slopes along {terms} (in the unit box)"
-
-
-def _plain(data: xr.Dataset) -> dict[str, Any]:
-    """Return indices of all numbers together, and of each where they are few, as plain JSON."""
-    few = data.sizes["output"] <= 100
-    result: dict[str, Any] = {"unit": data.attrs["unit"], "evaluations": data.attrs["evaluations"]}
-    for name, values in data.variables.items():
-        if few or "output" not in values.dims:
-            result[str(name)] = values.values.tolist()
-    return result
 
 
 def _groups(texts: list[str]) -> dict[str, list[str]]:

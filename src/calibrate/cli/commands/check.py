@@ -158,6 +158,7 @@ def _mesh(arguments: Namespace) -> Answer:
 
     from calibrate.measurements.outputs import mesh_errors
     from emulator.accuracy.mesh_error import mesh_error
+    from emulator.fem.outcome import by_name
     from emulator.geometry.discretisation import mesh_quality
 
     folder = None if arguments.out is None else check_folder(arguments.out)
@@ -170,7 +171,7 @@ def _mesh(arguments: Namespace) -> Answer:
     length = np.linalg.norm(error.coarse, axis=1)
     result: dict[str, Any] = {
         "scene": scene.name,
-        "theta": words.theta_by_name(scene, theta),
+        "theta": by_name(scene, theta),
         "nodes": len(scene.mesh.nodes),
         "quality": quality._asdict(),
         "finer_nodes": len(error_of_mesh.finer.scene.mesh.nodes),

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calibrate.cli import words
-from calibrate.cli.output import table, volume_lines, volumes
+from calibrate.cli.output import table, volume_lines
 from calibrate.cli.words import Answer, command, flag, option
 from emulator.core.errors import InputError
 from emulator.core.store import check_folder, write_json
@@ -39,8 +39,7 @@ def predict(arguments: Namespace) -> Answer:
     import numpy as np
 
     from emulator.accuracy.estimate import guard
-    from emulator.fem.fields import element_fields
-    from emulator.geometry.io import write_solution
+    from emulator.fem.outcome import by_name, cavity_volumes, write_outcome
     from emulator.surrogates import load
 
     if arguments.out:
@@ -58,19 +57,20 @@ def predict(arguments: Namespace) -> Answer:
         estimate = ErrorBar(forward, Simulator(scene)).of_field(u, theta)
         against = estimate.guard
     finite = bool(against.finite)
+    error_of = None if estimate is None or not estimate.valid else estimate.of
     result: dict[str, Any] = {
         "emulator": arguments.emulator,
         "scene": scene.name,
-        "theta": words.theta_by_name(scene, theta),
+        "theta": by_name(scene, theta),
         "trusted": bool(against.trusted),
         "guard": against.sentence(scene),
         "max_displacement": float(np.linalg.norm(u, axis=1).max()) if finite else None,
         "least_J": float(against.least_J) if finite else None,
-        "volumes": volumes(scene, u, estimate) if finite else {},
+        "volumes": cavity_volumes(scene, u, error_of) if finite else {},
         "error": None if estimate is None else _error_of(estimate, scene, theta),
     }
     if arguments.out and finite and against.least_J > 0.0:
-        write_solution(arguments.out, scene.mesh, np.asarray(u), element_fields(scene, u, theta))
+        write_outcome(arguments.out, scene, u, theta)
         result["out"] = arguments.out
     return Answer(result, prediction_summary(result), result["trusted"])
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import time
 from argparse import ArgumentParser, Namespace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calibrate.cli import words
-from calibrate.cli.output import volume_lines, volumes
+from calibrate.cli.output import volume_lines
 from calibrate.cli.words import Answer, command, flag, option
 from emulator.core.errors import InputError
 from emulator.core.store import check_folder
@@ -17,27 +16,7 @@ from emulator.core.store import check_folder
 if TYPE_CHECKING:
     import jax
 
-    from emulator.fem import Solution
-    from emulator.fem.unloading import Unloaded
     from emulator.scenes.forward_problem import ForwardProblem
-
-
-def _solved(
-    scene: ForwardProblem, theta: Any, solution: Solution | Unloaded
-) -> tuple[dict[str, Any], str]:
-    """Return the outcome of a solve, as plain JSON and in a line."""
-    from emulator.fem import Status
-
-    status = Status(int(solution.status))
-    result = {
-        "scene": scene.name,
-        "theta": words.theta_by_name(scene, theta),
-        "status": status.name.lower(),
-        "iterations": int(solution.iterations),
-        "residual": float(solution.residual),
-        "load_reached": float(solution.load_reached),
-    }
-    return result, f"{scene.name}: {status.text}, {result['iterations']} Newton iterations"
 
 
 @command(
@@ -49,14 +28,8 @@ def _solved(
 )
 def simulate(arguments: Namespace) -> Answer:
     """Solve at one theta, and find status and key figures."""
-    import jax
-    import numpy as np
-
     from emulator.fem import NewtonOptions, Simulator
-    from emulator.fem.energy import potential_energy, volume_ratio
-    from emulator.fem.fields import element_fields
-    from emulator.fem.reactions import supported_sets
-    from emulator.geometry.io import write_solution
+    from emulator.fem.outcome import described, equilibrium, write_outcome
     from emulator.scenes.scene import Scene, with_mesh
 
     problem = words.problem_of(arguments)
@@ -68,46 +41,33 @@ def simulate(arguments: Namespace) -> Answer:
         words.check_vtu(arguments.out)
     simulator = Simulator(scene, NewtonOptions.load_steps(arguments.load_steps))
     solution = simulator.solve(theta)
-    u, converged = solution.displacement, bool(solution.converged)
-    J = np.asarray(jax.jit(partial(volume_ratio, scene))(u))
-    # A follower pressure on an open patch has no potential energy. Where the mesh is the loaded
-    # shape, energy, stresses and reactions belong to the scene at rest (calibrate unload).
-    at_rest = not scene.loaded_by
-    has_potential = at_rest and all(load.has_potential for load in scene.loads)
-    energy = float(jax.jit(potential_energy(scene))(u, theta)) if has_potential else None
-    stable = simulator.is_stable(u, theta) if has_potential and converged else None
-    result, line = _solved(scene, theta, solution)
-    result |= {
-        "energy": energy,
-        "stable": stable,
-        "max_displacement": float(np.linalg.norm(u, axis=1).max()),
-        "J_range": [float(J.min()), float(J.max())],
-        "volumes": volumes(scene, u),
-    }
+    result = described(scene, theta, solution) | equilibrium(simulator, theta, solution)
+    energy, (least, most) = result["energy"], result["J_range"]
     energy_text = "no potential energy" if energy is None else f"energy {energy:.8g} mN mm"
     lines = [
-        line,
+        _in_a_line(result),
         f"largest displacement {result['max_displacement']:.6g} mm, {energy_text}",
-        f"J from {J.min():.4f} to {J.max():.4f}, relative residual {result['residual']:.1e}",
+        f"J from {least:.4f} to {most:.4f}, relative residual {result['residual']:.1e}",
         *volume_lines(result["volumes"]),
     ]
-    if converged:
-        result["reactions"] = {
-            name: simulator.reaction(name, u, theta).tolist()
-            for name in (supported_sets(scene) if at_rest else ())
-        }
-        for name, force in result["reactions"].items():
-            components = ", ".join(f"{component:.5g}" for component in force)
-            lines.append(f"force of the support '{name}' on the body: {components} mN")
-    if arguments.out and converged:
-        fields = element_fields(scene, u, theta) if at_rest else {}
-        write_solution(arguments.out, scene.mesh, np.asarray(u), fields)
+    for name, force in result.get("reactions", {}).items():
+        components = ", ".join(f"{component:.5g}" for component in force)
+        lines.append(f"force of the support '{name}' on the body: {components} mN")
+    if arguments.out and solution.converged:
+        write_outcome(arguments.out, scene, solution.displacement, theta)
         result["out"] = arguments.out
-    if stable is False:
+    if result["stable"] is False:
         lines.append(
             "an unstable equilibrium: it has buckled, and any imperfection leads elsewhere"
         )
-    return Answer(result, "\n".join(lines), converged)
+    return Answer(result, "\n".join(lines), bool(solution.converged))
+
+
+def _in_a_line(result: dict[str, Any]) -> str:
+    from emulator.fem import Status
+
+    status = Status[result["status"].upper()]
+    return f"{result['scene']}: {status.text}, {result['iterations']} Newton iterations"
 
 
 def _simulate_states(problem: ForwardProblem, theta: jax.Array) -> Answer:
@@ -115,6 +75,7 @@ def _simulate_states(problem: ForwardProblem, theta: jax.Array) -> Answer:
     import numpy as np
 
     from emulator.fem.energy import volume_ratio
+    from emulator.fem.outcome import described
     from emulator.specimens.homogeneous import homogeneous, homogeneous_stresses
     from emulator.specimens.specimen import require_specimen
 
@@ -123,7 +84,7 @@ def _simulate_states(problem: ForwardProblem, theta: jax.Array) -> Answer:
     solution = states.solve(theta)
     J = np.asarray(volume_ratio(specimen, solution.displacement))
     P = np.asarray(homogeneous_stresses(specimen, solution.displacement, theta)[1])
-    result, _ = _solved(specimen, theta, solution)
+    result = described(specimen, theta, solution)
     result |= {"J_range": [float(J.min()), float(J.max())], "stresses_kPa": P.tolist()}
     lines = [
         f"{specimen.name}: {result['status']}, {len(J)} states",
@@ -156,19 +117,19 @@ def unload(arguments: Namespace) -> Answer:
     import numpy as np
 
     from emulator.fem import Simulator, Status
-    from emulator.fem.fields import element_fields
+    from emulator.fem.outcome import cavity_volumes, described, write_outcome
     from emulator.fem.unloading import Unloader
-    from emulator.geometry.io import write_mesh, write_solution
+    from emulator.geometry.io import write_mesh
 
     scene = words.scene_of(arguments)
     theta = words.theta_of(arguments, scene)
     if arguments.out:
         check_folder(arguments.out)
     unloaded = Unloader(scene).solve(theta)
-    result, line = _solved(scene, theta, unloaded)
+    result = described(scene, theta, unloaded)
     if not unloaded.converged:
         result["taken_off"] = {name: amount for name, (amount, _) in unloaded.taken_off.items()}
-        return Answer(result, f"{line}\n{unloaded.limit}", usable=False)
+        return Answer(result, f"{_in_a_line(result)}\n{unloaded.limit}", usable=False)
     rest, start = unloaded.scene, np.asarray(unloaded.start)
     reloaded = Simulator(rest).solve(theta)
     status = Status(int(reloaded.status))
@@ -177,7 +138,7 @@ def unload(arguments: Namespace) -> Answer:
         "largest_displacement": float(np.linalg.norm(unloaded.displacement, axis=1).max()),
         "volumes": {
             name: {"loaded_ml": volume["rest_ml"], "unloaded_ml": volume["volume_ml"]}
-            for name, volume in volumes(scene, unloaded.displacement).items()
+            for name, volume in cavity_volumes(scene, unloaded.displacement).items()
         },
         "reloaded": {
             "status": status.name.lower(),
@@ -185,7 +146,7 @@ def unload(arguments: Namespace) -> Answer:
             "missed": missed,
         },
     }
-    lines = [line, f"largest displacement {result['largest_displacement']:.6g} mm"]
+    lines = [_in_a_line(result), f"largest displacement {result['largest_displacement']:.6g} mm"]
     lines += [
         f"cavity '{name}': {volume['unloaded_ml']:.6g} mL, under load {volume['loaded_ml']:.6g} mL"
         for name, volume in result["volumes"].items()
@@ -204,8 +165,7 @@ def unload(arguments: Namespace) -> Answer:
         folder = Path(arguments.out)
         folder.mkdir(parents=True, exist_ok=True)
         write_mesh(folder / MESH, rest.mesh, rest.fibres, rest.sheets)
-        fields = element_fields(rest, unloaded.start, theta)
-        write_solution(folder / LOADED, rest.mesh, start, fields)
+        write_outcome(folder / LOADED, rest, unloaded.start, theta)
         result["out"] = arguments.out
         lines.append(f"written to {arguments.out}: {MESH}, {LOADED}")
     return Answer(result, "\n".join(lines), agrees)

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from calibrate.cli import words
 from calibrate.cli.output import table
 from calibrate.cli.words import Answer, command, option
 from emulator.core.errors import InputError
 from emulator.core.store import check_folder
+
+if TYPE_CHECKING:
+    from emulator.scenes.scene import Scene
 
 
 @command(
@@ -57,19 +59,47 @@ from emulator.core.store import check_folder
     "epicardium@es=epi_010.obj --out frames.csv",
 )
 def frames(arguments: Namespace) -> Answer:
-    """Measure the surfaces, and write the data."""
+    """Measure the surfaces or read the full field, and write the data."""
+    import numpy as np
+
     from calibrate.measurements.data import write_data
+
+    check_folder(Path(arguments.out).parent)
+    if bool(arguments.field) is bool(arguments.surface):
+        raise InputError("frames: give either --surface or --field")
+    measure = _full_field if arguments.field else _surfaces
+    observe, data, known = measure(words.scene_of(arguments), arguments)
+    write_data(arguments.out, observe, data, known)
+    result = {
+        name: {
+            "mean": float(np.nanmean(values)),
+            "sd": float(np.nanstd(values)),
+            "missing": int(np.isnan(values).sum()),
+        }
+        for name, values in data.items()
+    }
+    rows = [(n, f"{of['mean']:.4g}", f"{of['sd']:.3g}", of["missing"]) for n, of in result.items()]
+    lines = [table(("data", "mean (mm, mL, N)", "sd", "missing"), rows)]
+    if arguments.force:
+        lines.append(_THICKNESS)
+    lines.append(f"written to {arguments.out}")
+    return Answer({"out": arguments.out, "data": result}, "\n".join(lines))
+
+
+_THICKNESS = (
+    "forces tell stiffness times thickness: the share by which the mesh's thickness may be off is "
+    'an error of kind "gain" (docs/full_field.md)'
+)
+_Measured = tuple[Any, dict[str, Any], dict[str, float]]  # observations, data, known parameters
+
+
+def _surfaces(scene: Scene, arguments: Namespace) -> _Measured:
     from calibrate.measurements.frames import frame_data
     from calibrate.state_names import states_of
     from emulator.core.errors import look_up
     from emulator.core.units import IN_MM
     from emulator.hearts.surfaces import read_surface
 
-    check_folder(Path(arguments.out).parent)
-    if bool(arguments.field) is bool(arguments.surface):
-        raise InputError("frames: give either --surface or --field")
-    if arguments.field:
-        return _full_field(arguments)
     look_up(IN_MM, arguments.unit, "unit")
     states_of((word.partition("=")[0] for word in arguments.surface), "surfaces")
     surfaces = {}
@@ -80,59 +110,22 @@ def frames(arguments: Namespace) -> Answer:
                 f"--surface '{word}'; give each as SET@STATE=FILE, such as lv_endocardium@es=lv.obj"
             )
         surfaces[name] = read_surface(path, name, IN_MM[arguments.unit])
-    observe, data = frame_data(words.scene_of(arguments), surfaces, arguments.points)
-    write_data(arguments.out, observe, data)
-    return _measured(data, arguments.out)
+    return *frame_data(scene, surfaces, arguments.points), {}
 
 
-def _full_field(arguments: Namespace) -> Answer:
-    """Read a full field and the force beside it, and write the data."""
-    import numpy as np
+def _full_field(scene: Scene, arguments: Namespace) -> _Measured:
+    from calibrate.measurements.full_field import measured_field
 
-    from calibrate.measurements import parse_observation
-    from calibrate.measurements.collection import observations
-    from calibrate.measurements.data import write_data
-    from calibrate.measurements.full_field import (
-        field_data,
-        read_amounts,
-        read_curve,
-        read_full_field,
-        sign_of,
-        spread_points,
-    )
-    from calibrate.state_names import in_state
-
-    scene = words.scene_of(arguments)
     if arguments.amount is None or len(arguments.field) > 2:
         raise InputError("--field: give one or two files, and --amount PARAMETER=FILE:COLUMN")
-    parameter, path, column = _split(arguments.amount, "--amount", "PARAMETER=FILE:COLUMN")
-    field = read_full_field(*arguments.field)
-    amounts = read_amounts(path, column)
-    sign = sign_of(scene, parameter, amounts)
-    amounts = {frame: sign * amount for frame, amount in amounts.items()}
-    loaded_frames = [frame for frame in field.frames if amounts.get(frame) != 0.0]
-    count = min(arguments.points, len(field.points))
-    field = field.only(arguments.only or loaded_frames, spread_points(field.points, count))
-    observe, data = field_data(scene, field, amounts)
-    parts = dict(observe.parts)
-    for curve in arguments.force:
-        usage = "REACTION=FILE:AMOUNT:COLUMN"
-        word, path, *columns = _split(curve, "--force", usage)
-        at, force = read_curve(path, columns[0], columns[1], list(amounts.values()))
-        ((name, part),) = parse_observation(scene, word, 0).parts.items()
-        if in_state(name, field.frames[0]) in parts:
-            raise InputError(f"--force: {word} is given twice; give one curve for each")
-        for frame in field.frames:
-            if not at[0] <= amounts[frame] <= at[-1]:
-                raise InputError(
-                    f"--force: {path} goes from {at[0]:.4g} to {at[-1]:.4g}, frame '{frame}' is at "
-                    f"{amounts[frame]:.4g}"
-                )
-            parts[in_state(name, frame)] = part
-            data[in_state(name, frame)] = np.array(np.interp(amounts[frame], at, force))
-    known = {in_state(parameter, frame): amounts[frame] for frame in field.frames}
-    write_data(arguments.out, observations(parts), data, known)
-    return _measured(data, arguments.out)
+    return measured_field(
+        scene,
+        arguments.field,
+        _split(arguments.amount, "--amount", "PARAMETER=FILE:COLUMN"),
+        [_split(word, "--force", "REACTION=FILE:AMOUNT:COLUMN") for word in arguments.force],
+        frames=arguments.only,
+        points=arguments.points,
+    )
 
 
 def _split(word: str, flag: str, usage: str) -> list[str]:
@@ -142,21 +135,3 @@ def _split(word: str, flag: str, usage: str) -> list[str]:
     if not equals or len(parts) != usage.count(":") + 2 or not all(parts):
         raise InputError(f"{flag} '{word}'; give {usage}")
     return parts
-
-
-def _measured(data: Mapping[str, Any], out: str) -> Answer:
-    """Return a table of the measured data."""
-    import numpy as np
-
-    rows, result = [], {}
-    for name, values in data.items():
-        known = values[np.isfinite(values)]
-        of = {
-            "mean": float(known.mean()),
-            "sd": float(known.std()),
-            "missing": int(np.isnan(values).sum()),
-        }
-        result[name] = of
-        rows.append((name, f"{of['mean']:.4g}", f"{of['sd']:.3g}", of["missing"]))
-    text = table(("data", "mean (mm, mL, N)", "sd", "missing"), rows)
-    return Answer({"out": out, "data": result}, f"{text}\nwritten to {out}")

@@ -45,12 +45,12 @@ _FAR = 0.15  # of the body's length
 )
 def init(arguments: Namespace) -> Answer:
     """Write the scene file, and describe the mesh."""
-    from emulator.core.cells import SPREADSHEETS, TEXT
+    from emulator.core.cells import OTHER_SPREADSHEETS, SPREADSHEETS, TEXT
     from emulator.scenes.draft import draft_scene
 
     mesh_path = Path(arguments.mesh)
     out = arguments.out or mesh_path.parent / f"{mesh_path.stem or 'scene'}.toml"
-    if mesh_path.suffix.lower() in (*TEXT, *SPREADSHEETS):
+    if mesh_path.suffix.lower() in (*TEXT, *SPREADSHEETS, *OTHER_SPREADSHEETS):
         return _init_specimen(mesh_path, out, arguments)
     if arguments.tube is not None:
         raise InputError("--tube is for a table of stretches and pressures, not for a mesh")
