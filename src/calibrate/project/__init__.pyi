@@ -2,6 +2,7 @@ from .calibration import certify_and_keep, infer, report
 from .problem import (
     Problem,
     by_fem,
+    by_rounds,
     make_data,
     model_before_data,
     read_problem,
@@ -14,6 +15,7 @@ __all__ = [
     "Problem",
     "Run",
     "by_fem",
+    "by_rounds",
     "certify_and_keep",
     "holds_population",
     "infer",

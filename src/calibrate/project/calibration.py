@@ -14,7 +14,14 @@ from calibrate.certificate.check import can_reweight, reweighted
 from calibrate.measurements import missing_values
 from calibrate.posterior import Posterior, sample
 from calibrate.posterior.diagnosis import MAP_ERRORS, MAP_MOVES, SCALED_NOISE
-from calibrate.project.problem import Problem, build_model, read_problem, simulator_of, with_data
+from calibrate.project.problem import (
+    Problem,
+    build_model,
+    by_rounds,
+    read_problem,
+    simulator_of,
+    with_data,
+)
 from calibrate.project.results import (
     CERTIFICATE,
     SAMPLING,
@@ -71,7 +78,7 @@ def infer(
     target, stages = None if folder is None else Path(folder), Stages(show=progress)
     with nullcontext() if target is None else reserved(target, force=force):
         with stages("scene and data"):
-            problem = with_data(read_problem(run))
+            problem = with_data(by_rounds(read_problem(run)))
         with stages("forward map and model"):
             model, data = build_model(problem, progress=progress)
         sampler, options = problem.run.sampling()

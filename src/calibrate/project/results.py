@@ -33,7 +33,7 @@ from calibrate.measurements import leave_out_missing, observations_from_json
 from calibrate.measurements.data import write_data
 from calibrate.model_error import ModelError
 from calibrate.posterior import Posterior, read_tree
-from calibrate.project.problem import Problem, ingredients, model_of
+from calibrate.project.problem import Problem, as_wide, ingredients, model_of
 from calibrate.project.run import Run
 from emulator.catalogue import find_problem
 from emulator.core import schema
@@ -144,7 +144,7 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
             f"{folder} holds a population; name one of its members, {folder / MEMBERS}/NAME"
         )
     run = schema.read_json_as(Run, folder / RUN)
-    scene = find_problem(run.scene, run.root)
+    scene = as_wide(run, find_problem(run.scene, run.root))[1]
     tree = read_tree(path)
     if tree.attrs.get("scene_fingerprint") != scene.fingerprint:
         raise InputError(f"{path} was made for another scene than '{run.scene}'")
