@@ -123,11 +123,11 @@ def examine(
         solver = FEMRunner(predictive, FEMLikelihood(posterior.model, simulator), bar)
         with stages("FEM where the map was asked"):
             rows = np.linspace(0, len(z) - 1, max(round(_AT_DRAWS * count), 5)).astype(int)
-            at_draws = solver(z[rows], stability=_STABILITY)
+            at_draws = solver(z[rows], stability=_STABILITY, slopes=True)
             # Next to the draws the map may hide a part of the posterior, by an error that draws of
             # the prior are too far apart to show.
             surroundings = Kernels.surrounding(z, rng).sample(rng, max(round(_AROUND * count), 4))
-            around = solver(surroundings)
+            around = solver(surroundings, slopes=True)
             prior = predictive.prior_draws(key_from(rng), max(round(_AT_PRIOR * count), 4))
             at_prior = solver(prior, slopes=True)
             # Only descents of FEM's own misfit lead to a mode that the map hides altogether.
@@ -138,7 +138,7 @@ def examine(
             while True:
                 training, pool = _train(solver, z, training, modes, count, most, rng)
                 rows, log_drawn = pool.tests(total - len(training.z), rng)
-                tests = Tests(pool, solver(pool.z[rows]), rows, log_drawn)
+                tests = Tests(pool, solver(pool.z[rows], slopes=True), rows, log_drawn)
                 runs = FEMRuns.joined([training, tests.runs])
                 evidence = evidence_of(posterior, at_draws, training, tests, len(modes), rng)
                 count = _further_runs(total, most)
@@ -195,7 +195,7 @@ def _train(
         chances = tempered(pool.log_explored, MOST_TEMPERED)
         if chances.any():
             points = pool.z[rng.choice(len(pool.z), size=size, p=chances)]
-            runs = FEMRuns.joined([runs, solver(points)])
+            runs = FEMRuns.joined([runs, solver(points, slopes=True)])
         pool = pool.corrected_by(correction_from(runs, predictive, most))
         if effective(normalised(pool.log_explored)) < MOST_TEMPERED:
             pool = pool.stepped(pool.log_explored, rng)

@@ -30,6 +30,7 @@ from calibrate.project.results import (
     save_results,
     save_reweighted,
 )
+from calibrate.project.rounds import ROUNDS_RECORD
 from calibrate.project.run import Run
 from calibrate.provenance import as_attributes
 from calibrate.state_names import split
@@ -40,6 +41,7 @@ from emulator.core.store import write_json
 from emulator.fem import Simulator
 from emulator.scenes.scene import Scene
 from emulator.surrogates.fem import FEMForward
+from emulator.surrogates.taught import TaughtEmulator
 
 NOT_CERTIFIED = "not certified"
 SECONDS = "seconds"  # attribute of a posterior: the seconds of each stage, as JSON
@@ -99,10 +101,12 @@ def infer(
             with stages("check of the map"):
                 simulator = cast(Simulator, problem.simulator)
                 errors = map_errors(posterior.model, simulator, posterior.draws(), posterior.data)
-        attributes = {
+        attributes: dict[str, Any] = {
             SCALED_NOISE: problem.scaled_noise, MAP_ERRORS: errors.sizes, MAP_MOVES: errors.moves,
             SECONDS: stages.seconds,
         }  # fmt: skip
+        if isinstance(model.full, TaughtEmulator):
+            attributes[ROUNDS_RECORD] = model.full.emulator.record[ROUNDS_RECORD]
         posterior.tree.attrs.update(as_attributes(attributes))
         if target is not None:
             save_results(target, problem, posterior)

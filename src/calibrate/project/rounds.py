@@ -10,7 +10,7 @@ each parameter, and FEM is asked where it says most:
    draws of that posterior, which test the process before they teach it, half are far from all runs,
    where it doubts.
 3. **End.** The rounds end when the process foresees FEM at the draws of a round: their log
-   likelihoods differ by less than 0.15 nats in root mean square, twice, or no more runs are
+   likelihoods differ by less than 0.1 nats in root mean square, twice, or no more runs are
    allowed. A posterior whose log density is wrong by the sd :math:`s` has means wrong by :math:`s`
    sd at most, since :math:`|\mathrm{cov}(x, w)| \le \mathrm{sd}(x)\, \mathrm{sd}(w)`.
 4. **Teach.** The displacements of all runs, with their sensitivities, become an emulator of the
@@ -46,10 +46,12 @@ from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.taught import TaughtEmulator, taught
 from emulator.training.mechanics import add_discrepancy
 
+ROUNDS_RECORD = "rounds"
+"""The entry of an emulator's record, and the attribute of a posterior, that lists the rounds."""
 _A_ROUND = 8  # runs of a round; half of them are draws
 _BEGIN = 10  # runs spread over the prior
 _CANDIDATES = 16  # points of which one is taken, where the farthest are
-_FORESEEN = 0.15  # nats by which a log likelihood may be missed
+_FORESEEN = 0.1  # nats by which a log likelihood may be missed
 _LIKELY = 0.99  # mass of the Gaussian at the best run in which draws count
 _NOISE_DRAWS = 256  # draws of the prior of a noise sd that is inferred
 
@@ -115,7 +117,7 @@ def teach(
             bar.set_postfix_str(f"log likelihoods missed by {rounds[-1].missed:.2g}")
         bar.close()
     emulator, record = add_discrepancy(Emulator(simulator.scene), _runs_of(likelihood.rows))
-    record = {"discrepancy": record, "rounds": [asdict(r) for r in rounds]}
+    record = {"discrepancy": record, ROUNDS_RECORD: [asdict(r) for r in rounds]}
     return taught(replace(emulator, record=record)), rounds
 
 

@@ -42,7 +42,9 @@ from emulator.core.gaussian_process import Regression, squared_exponential
 
 _LENGTHS = (0.25, 0.5, 1.0, 2.0, 4.0)  # correlation lengths that are compared, in sd of the points
 _NUGGETS = (1e-6, 1e-4, 1e-2, 1.0, 1e2)
+_FIRST_NUGGETS = (1e-6, 1e-2)  # with which lengths are compared
 _TREND = 1e2
+_MOST_OBSERVATIONS = 800  # beyond which derivatives at points that FEM finds unlikely are left out
 _NEGLIGIBLE = 1e-3  # leave-one-out error, in noise sd, that changes no posterior
 
 
@@ -145,25 +147,41 @@ def fit_correction(
     """
     every = np.ones(len(x), dtype=bool)
     likely = every if likely is None or not likely.any() else likely
-    parts, kernels = [every], list(product(_LENGTHS, _NUGGETS))
+    parts = [every]
     # Precise data: the map misses far away by so much that errors near the posterior are hidden.
     if x.shape[1] + 2 <= likely.sum() < len(x):
         parts.append(likely)
     if like is not None and like.nugget > 0.0:
-        parts, kernels = parts[-1:] if like.local else parts[:1], [(like.length, like.nugget)]
-    if slopes is None:
-        slopes = np.full((*x.shape, errors.shape[1]), np.nan)
-    observed = np.concatenate([errors[:, None], slopes], axis=1)  # (n, 1 + q, m)
+        parts = parts[-1:] if like.local else parts[:1]
+    else:
+        like = None
+    observed = _observations(errors, slopes, x.shape[1], likely)
     squared_errors = np.mean((errors / scales) ** 2, axis=1)
     best = no_correction(rows, x.shape[1], errors.shape[1])._replace(
         scale=float(np.mean(squared_errors / (_TREND * (x**2).sum(axis=1) + _TREND + 1.0)))
     )
     smallest = np.log(squared_errors[likely] + _NEGLIGIBLE**2).mean()
     for used in parts:
-        fitted, loss = _fitted(x[used], observed[used], scales, rows, likely[used], kernels)
+        fitted, loss = _fitted(x[used], observed[used], scales, rows, likely[used], like)
         if loss < smallest:
             best, smallest = fitted._replace(local=used is not every), loss
     return best
+
+
+def _observations(
+    errors: np.ndarray, slopes: np.ndarray | None, features: int, likely: np.ndarray
+) -> np.ndarray:
+    """Return errors and derivatives (n, 1 + q, m), NaN where they are unknown or too many."""
+    count, data = errors.shape
+    observed = np.full((count, 1 + features, data), np.nan)
+    observed[:, 0] = errors
+    if slopes is not None:
+        known = np.isfinite(slopes).all(axis=(1, 2))
+        room = max(_MOST_OBSERVATIONS - count, 0) // features
+        first = np.argsort(~(known & likely), kind="stable")
+        rows = [k for k in first if known[k]][:room]
+        observed[rows, 1:] = slopes[rows]
+    return observed
 
 
 def _fitted(
@@ -172,11 +190,12 @@ def _fitted(
     scales: np.ndarray,
     rows: int,
     likely: np.ndarray,
-    kernels: list[tuple[float, float]],
+    like: Correction | None,
 ) -> tuple[Correction, float]:
     """Return the process of these points, and the mean log of its errors where it is ``likely``.
 
     observed : the errors and their derivatives (n, 1 + q, m), NaN where there are none.
+    like : the correction whose kernel is taken; None to search for one.
     """
     count, per_run, data = observed.shape
     width = x.std(axis=0)
@@ -187,10 +206,9 @@ def _fitted(
     y = (observed * units).reshape(-1, data)[known]
     runs = np.repeat(np.arange(count), per_run)[known]
     blocks = [np.flatnonzero(runs == k) for k in range(count)]
-    smallest, where_likely, best = np.inf, np.inf, None
-    covariances = {length: _covariance(x, length) for length in dict(kernels)}
-    for length, nugget in kernels:
-        kernel = covariances[length].reshape(len(known), -1)[np.ix_(known, known)]
+
+    def process(length: float, nugget: float) -> _Process:
+        kernel = _covariance(x, length).reshape(len(known), -1)[np.ix_(known, known)]
         # Beside the trend, values have the variance 1, and derivatives that of a bump this long.
         noise = np.where(np.arange(len(known)) % per_run == 0, 1.0, length**-2.0)[known]
         regression = Regression.of(kernel + nugget * np.diag(noise))
@@ -200,18 +218,33 @@ def _fitted(
         variance = np.array([column[0, 0] for column in left_out])
         error = np.array([c[:, 0] @ weights[b] for c, b in zip(left_out, blocks, strict=True)])
         square = np.mean((error / scales) ** 2, axis=1)
-        # Geometric mean over the points, so that the prior's corners do not decide.
-        losses = np.log(square + _NEGLIGIBLE**2)
-        if losses.mean() < smallest:
-            smallest, where_likely = losses.mean(), losses[likely].mean()
-            scale = float(np.mean(square / variance))
-            best = length, nugget, scale, weights, inverse
-    if best is None:
-        return no_correction(rows, per_run - 1, data), np.inf
-    length, nugget, scale, weights, inverse = best
-    entries, size = np.flatnonzero(known), len(inverse)
+        # The mean of the logarithm over the points, so that the prior's corners do not decide.
+        losses, scale = np.log(square + _NEGLIGIBLE**2), float(np.mean(square / variance))
+        where_likely = float(losses[likely].mean())
+        return _Process(float(losses.mean()), where_likely, length, nugget, scale, weights, inverse)
+
+    if like is None:
+        processes = [process(*kernel) for kernel in product(_LENGTHS, _FIRST_NUGGETS)]
+        length = min(processes, key=lambda p: p.loss).length
+        processes += [process(length, n) for n in _NUGGETS if n not in _FIRST_NUGGETS]
+    else:
+        processes = [process(like.length, like.nugget)]
+    best = min(processes, key=lambda p: p.loss)
+    size = len(best.inverse)
     fitted = no_correction(rows, per_run - 1, data, size)
-    fitted.at[:count], fitted.observed[:size] = x, entries
-    fitted.weights[:size], fitted.inverse[:size, :size] = weights, inverse
-    kernel = {"length": length, "nugget": nugget, "scale": scale}
-    return fitted._replace(centre=centre, width=width, **kernel), where_likely
+    fitted.at[:count], fitted.observed[:size] = x, np.flatnonzero(known)
+    fitted.weights[:size], fitted.inverse[:size, :size] = best.weights, best.inverse
+    kernel = {name: getattr(best, name) for name in ("length", "nugget", "scale")}
+    return fitted._replace(centre=centre, width=width, **kernel), best.where_likely
+
+
+class _Process(NamedTuple):
+    """A Gaussian process of one kernel, and its losses: mean logs of squared errors left out."""
+
+    loss: float
+    where_likely: float
+    length: float
+    nugget: float
+    scale: float
+    weights: np.ndarray
+    inverse: np.ndarray
