@@ -77,6 +77,11 @@ def posterior_summary(report: Mapping[str, Any]) -> str:
         f"{report['chains']} chains x {report['draws']} draws, {report['divergences']} divergences"
         f", forward map: {report['forward']}"
     )
+    for last in report.get("rounds", [])[-1:]:
+        lines.append(
+            f"map: {last['runs']} FEM runs, chosen in {len(report['rounds'])} rounds; the last one's "
+            f"log likelihoods were foreseen to {last['missed']:.2g}"
+        )
     for name, mass in report.get("prior_cut", {}).items():
         lines.append(f"prior of {name} cut to its range: {100.0 * mass:.2g} % of its mass")
     for name, count in report.get("missing", {}).items():

@@ -172,6 +172,8 @@ def report(run: Run, posterior: Posterior, certificate: Certificate | None) -> d
         "warnings": posterior.warnings(),
         "seconds": json.loads(posterior.tree.attrs.get(SECONDS, "{}")),
     }
+    if ROUNDS_RECORD in posterior.tree.attrs:
+        result[ROUNDS_RECORD] = json.loads(posterior.tree.attrs[ROUNDS_RECORD])
     if "log_evidence" in posterior.tree.attrs:
         result["log_evidence"] = posterior.tree.attrs["log_evidence"]
         result["log_evidence_error"] = posterior.tree.attrs.get("log_evidence_error")
