@@ -79,8 +79,8 @@ def posterior_summary(report: Mapping[str, Any]) -> str:
     )
     for last in report.get("rounds", [])[-1:]:
         lines.append(
-            f"map: {last['runs']} FEM runs, chosen in {len(report['rounds'])} rounds; the last one's "
-            f"log likelihoods were foreseen to {last['missed']:.2g}"
+            f"map: {last['runs']} FEM runs where the posterior is, in {len(report['rounds'])} "
+            f"rounds; log likelihoods of the last were foreseen to {last['missed']:.2g}"
         )
     for name, mass in report.get("prior_cut", {}).items():
         lines.append(f"prior of {name} cut to its range: {100.0 * mass:.2g} % of its mass")

@@ -25,6 +25,7 @@ from calibrate.project.problem import (
 from calibrate.project.results import (
     CERTIFICATE,
     SAMPLING,
+    SOLUTIONS,
     remove_pages,
     reserved,
     save_results,
@@ -82,7 +83,8 @@ def infer(
         with stages("scene and data"):
             problem = with_data(by_rounds(read_problem(run)))
         with stages("forward map and model"):
-            model, data = build_model(problem, progress=progress)
+            keep = None if target is None else target / SOLUTIONS
+            model, data = build_model(problem, keep=keep, progress=progress)
         sampler, options = problem.run.sampling()
         with stages("sampling"):
             posterior = sample(
@@ -110,6 +112,7 @@ def infer(
         posterior.tree.attrs.update(as_attributes(attributes))
         if target is not None:
             save_results(target, problem, posterior)
+            (target / SOLUTIONS).unlink(missing_ok=True)
     return posterior
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any, cast
 
 import jax
@@ -261,12 +262,17 @@ def model_before_data(run: Run | Problem, *, progress: bool = False) -> Model:
     return with_described_errors(run_model, means, run.systematic)[0]
 
 
-def build_model(problem: Problem, *, progress: bool = False) -> tuple[Model, Mapping[str, Any]]:
-    """Return the statistical model of a problem with data, and the data that it is sampled with."""
+def build_model(
+    problem: Problem, *, keep: Path | None = None, progress: bool = False
+) -> tuple[Model, Mapping[str, Any]]:
+    """Return the statistical model of a problem with data, and the data that it is sampled with.
+
+    keep : the file of FEM's solutions while a map is taught by rounds.
+    """
     run = problem.run
     assert problem.data is not None, "with_data comes first"
     if run.forward == ROUNDS.name:
-        forward: ForwardMap = _taught(problem, progress=progress)
+        forward: ForwardMap = _taught(problem, keep, progress=progress)
     else:
         forward = build_forward(problem, progress=progress)
     run_model, data = _with_errors(problem, forward)
@@ -292,14 +298,16 @@ def _with_errors(problem: Problem, forward: ForwardMap) -> tuple[Model, Mapping[
     return with_described_errors(run_model, problem.data, problem.run.systematic)
 
 
-def _taught(problem: Problem, *, progress: bool) -> ForwardMap:
+def _taught(problem: Problem, keep: Path | None, *, progress: bool) -> ForwardMap:
     """Return the map that rounds of FEM runs teach, from the body at rest."""
     scene = with_mesh(problem.scene)
     model, data = _with_errors(problem, Emulator(scene).cache())
     model, data = replace(model, check_scale=False).given(data)
     most = registry.full_options(ROUNDS.name, problem.run.forward_options)["most_runs"]
     simulator = cast(Simulator, problem.simulator)
-    return teach(model, data, simulator, most=most, seed=problem.run.seed, progress=progress)[0]
+    return teach(
+        model, data, simulator, most=most, seed=problem.run.seed, keep=keep, progress=progress
+    )
 
 
 def by_fem(model: Model, load_steps: int = 1) -> Model:

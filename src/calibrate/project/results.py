@@ -45,6 +45,7 @@ RUN, DATA, POSTERIOR, CERTIFICATE = "run.json", "data.csv", "posterior.nc", "cer
 FORWARD, ERROR = "forward.safetensors", "error.safetensors"
 REPORT = "report.html"
 SAMPLING = "sampling.safetensors"  # checkpoint of a run that has not ended
+SOLUTIONS = "solutions.safetensors"  # FEM's, of a run whose map is still being taught
 POPULATION = "population"  # entry of what members share in run.json and in experiment files
 MEMBERS = "members"  # entry of a population's members in run.json, and folder of their runs
 

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -38,9 +39,9 @@ from calibrate.statistical_model.predictive import Predictive
 from emulator.core.display import counting
 from emulator.core.errors import SolverError
 from emulator.core.machine import one_blas_thread
+from emulator.core.store import read_arrays, save_arrays
 from emulator.fem import Simulator
-from emulator.fem.campaign import Runs
-from emulator.fem.campaign.workers import Row
+from emulator.fem.campaign import Field, Runs
 from emulator.surrogates.discrepancy import maximin_subset
 from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.taught import TaughtEmulator, taught
@@ -48,6 +49,7 @@ from emulator.training.mechanics import add_discrepancy
 
 ROUNDS_RECORD = "rounds"
 """The entry of an emulator's record, and the attribute of a posterior, that lists the rounds."""
+_ARRAYS = ("theta", "displacement", "sensitivities")  # of a file of solutions
 _A_ROUND = 8  # runs of a round; half of them are draws
 _BEGIN = 10  # runs spread over the prior
 _CANDIDATES = 16  # points of which one is taken, where the farthest are
@@ -77,14 +79,17 @@ def teach(
     *,
     most: int,
     seed: int = 0,
+    keep: Path | None = None,
     progress: bool = False,
-) -> tuple[TaughtEmulator, list[Round]]:
-    """Return an emulator of FEM runs where the posterior is, and what each round found.
+) -> TaughtEmulator:
+    """Return an emulator of FEM runs where the posterior is; its record lists the rounds.
 
     Parameters
     ----------
     model : the model of the data, of the body at rest in place of a forward map.
     most : the largest number of runs, each in every load state.
+    keep : the file of FEM's solutions, from which a killed search goes on: the same points are
+        asked, and those it holds are not solved again. None for none.
 
     Raises
     ------
@@ -92,7 +97,8 @@ def teach(
         FEM fails at most points of the prior.
     """
     rng = np.random.default_rng([seed, 2])
-    likelihood = FEMLikelihood(model, simulator, keep=True)
+    kept = {} if keep is None else _read(keep, simulator.scene.fingerprint)
+    likelihood = FEMLikelihood(model, simulator, kept=kept)
     rounds = list[Round]()
     with (
         one_blas_thread(),
@@ -102,7 +108,14 @@ def teach(
     ):
         predictive = Predictive(model, data, _noise_draws(model))
         solver = FEMRunner(predictive, likelihood, bar)
-        runs = solver(_spread_over_prior(predictive, min(_BEGIN, most), rng), slopes=True)
+
+        def ask(z: np.ndarray) -> FEMRuns:
+            answers = solver(z, slopes=True)
+            if keep is not None:
+                _write(keep, kept, simulator.scene.fingerprint)
+            return answers
+
+        runs = ask(_spread_over_prior(predictive, min(_BEGIN, most), rng))
         failed = int((~runs.converged).sum())
         if failed > 0.5 * len(runs.z):
             raise SolverError(
@@ -111,14 +124,14 @@ def teach(
             )
         while len(runs.z) < most and not _are_foreseen(rounds):
             fresh, predicted, drawn = _fresh_points(predictive, runs, most, rng)
-            answers = solver(fresh[: most - len(runs.z)], slopes=True)
+            answers = ask(fresh[: most - len(runs.z)])
             rounds.append(_judged(runs, answers, predicted, drawn))
             runs = FEMRuns.joined([runs, answers])
             bar.set_postfix_str(f"log likelihoods missed by {rounds[-1].missed:.2g}")
         bar.close()
-    emulator, record = add_discrepancy(Emulator(simulator.scene), _runs_of(likelihood.rows))
+    emulator, record = add_discrepancy(Emulator(simulator.scene), _runs_of(kept))
     record = {"discrepancy": record, ROUNDS_RECORD: [asdict(r) for r in rounds]}
-    return taught(replace(emulator, record=record)), rounds
+    return taught(replace(emulator, record=record))
 
 
 def _are_foreseen(rounds: list[Round]) -> bool:
@@ -180,12 +193,31 @@ def _judged(runs: FEMRuns, answers: FEMRuns, predicted: np.ndarray, drawn: int) 
     return Round(len(every.z), failed, size)
 
 
-def _runs_of(rows: list[Row]) -> Runs:
+def _runs_of(kept: Mapping[bytes, Field]) -> Runs:
     """Return the solutions, the last first: where there are too many, the first go."""
-    last_first = rows[::-1]
+    thetas, fields = list(kept)[::-1], list(kept.values())[::-1]
     return Runs(
-        jnp.stack([row.theta for row in last_first]),
-        jnp.stack([row.solution.displacement for row in last_first]),
-        jnp.full(len(rows), jnp.nan),
-        jnp.stack([row.sensitivities for row in last_first]),
+        jnp.asarray([np.frombuffer(theta) for theta in thetas]),
+        jnp.stack([jnp.asarray(field.displacement) for field in fields]),
+        jnp.full(len(fields), jnp.nan),
+        jnp.stack([jnp.asarray(field.sensitivities) for field in fields]),
     )
+
+
+def _write(path: Path, kept: Mapping[bytes, Field], fingerprint: str) -> None:
+    """Write solutions of the scene of ``fingerprint``."""
+    runs = _runs_of(kept)._asdict()
+    arrays = {name: np.asarray(runs[name])[::-1] for name in _ARRAYS}
+    save_arrays(path, {n: np.ascontiguousarray(a) for n, a in arrays.items()}, {"of": fingerprint})
+
+
+def _read(path: Path, fingerprint: str) -> dict[bytes, Field]:
+    """Return the solutions that a search of the same scene left; none where there are none."""
+    if not path.is_file():
+        return {}
+    arrays, metadata = read_arrays(path)
+    if metadata.get("of") != fingerprint or not set(_ARRAYS) <= set(arrays):
+        return {}
+    thetas, *fields = (arrays[name] for name in _ARRAYS)
+    rows = zip(*fields, strict=True)
+    return {theta.tobytes(): Field(*row) for theta, row in zip(thetas, rows, strict=True)}

@@ -18,7 +18,7 @@ from jax.flatten_util import ravel_pytree
 from calibrate.statistical_model.model import Data, Model
 from emulator.core.errors import InputError
 from emulator.fem import Simulator
-from emulator.fem.campaign import Field, Neighbours, Row, Solver, solve_rows
+from emulator.fem.campaign import Field, Neighbours, Solver, solve_rows
 from emulator.fem.energy import volume_ratio
 from emulator.fem.solution import EquilibriumSolver
 from emulator.scenes.scene import Scene
@@ -56,16 +56,23 @@ class FEMLikelihood:
 
     model : the statistical model.
     simulator : the simulator of the model's scene, or of its specimen.
-    keep : whether solutions are kept, with their sensitivities, in :attr:`rows`.
+    kept : the solutions at which nothing is solved again, with their sensitivities, by the bytes of
+        their theta; those of every solve are added. None to keep none.
 
     :class:`InputError` where the simulator is for another scene.
     """
 
-    def __init__(self, model: Model, simulator: EquilibriumSolver, *, keep: bool = False) -> None:
+    def __init__(
+        self,
+        model: Model,
+        simulator: EquilibriumSolver,
+        *,
+        kept: dict[bytes, Field] | None = None,
+    ) -> None:
         if simulator.scene.fingerprint != model.forward.scene.fingerprint:
             raise InputError("the simulator's scene is not the posterior's")
         self.model, self.simulator = model, simulator
-        self.keep, self.rows = keep, list[Row]()
+        self.kept = kept
         self._start, self._cheap = jax.jit(model.full), jax.jit(model.map_log_likelihood)
         self._fem, self._derivatives = jax.jit(self._by_fem), jax.jit(self._slopes_of_means)
 
@@ -91,22 +98,22 @@ class FEMLikelihood:
         stability : numbers of the draws for which ``stable`` is asked, too.
         slopes : whether ``slopes`` are asked for every draw, at a tenth of the time of a solve.
         """
-        for number, rows in self.equilibria(draws, slopes=slopes):
+        for number, solved in self.equilibria(draws, slopes=slopes):
             draw, thetas = draws[number], self.model.states.thetas(draws[number])
             cheap = float(self._cheap(dict(draw), data))
-            if rows is None:
+            if solved is None:
                 yield number, Likelihoods(-np.inf, cheap, converged=False, smallest_J=np.nan)
                 continue
-            fields = [row.solution.displacement for row in rows]
+            fields = [field.displacement for field in solved]
             fem, means, smallest_J = self._fem(jnp.stack(fields), thetas, dict(draw), data)
             stable = self._stable(fields, thetas) if number in stability else None
-            derivatives = self._slopes(rows, thetas) if slopes else None
+            derivatives = self._slopes(solved, thetas) if slopes else None
             values = (float(fem), cheap, True, float(smallest_J), means, stable, derivatives)
             yield number, Likelihoods(*values)
 
     def equilibria(
         self, draws: Sequence[Mapping[str, Any]], *, slopes: bool = False
-    ) -> Iterator[tuple[int, list[Row] | None]]:
+    ) -> Iterator[tuple[int, list[Field] | None]]:
         """Yield numbers of ``draws`` and their solutions, as they are finished.
 
         They are FEM's in each load state; ``None`` stands for a draw at which FEM did not converge
@@ -115,12 +122,25 @@ class FEMLikelihood:
         slopes : whether the solutions have their sensitivities.
         """
         thetas = jnp.concatenate([self.model.states.thetas(draw) for draw in draws])
-        states = len(self.model.states.states)
-        solutions: dict[int, dict[int, Row]] = {number: {} for number in range(len(draws))}
+        states, kept = len(self.model.states.states), {} if self.kept is None else self.kept
+        keys = [theta.tobytes() for theta in np.asarray(thetas)]
+        solutions = {
+            draw: {
+                s: kept[key] for s, key in enumerate(keys[draw * states :][:states]) if key in kept
+            }
+            for draw in range(len(draws))
+        }
+        for draw in [draw for draw, fields in solutions.items() if len(fields) == states]:
+            fields = solutions.pop(draw)
+            yield draw, [fields[k] for k in range(states)]
         # A draw that fails in one load state is done: its other states are not begun.
-        numbers = (k for k in range(len(thetas)) if k // states in solutions)
-        solver = Solver(self.simulator, sensitivities=slopes, from_rest_again=self.keep)
-        nearest = self._kept_beside(thetas) if self.keep else (lambda _: [])
+        numbers = (
+            k
+            for k in range(len(thetas))
+            if k // states in solutions and k % states not in solutions[k // states]
+        )
+        solver = Solver(self.simulator, sensitivities=slopes, from_rest_again=bool(kept))
+        nearest = self._kept_beside(thetas)
         # Not under jit: there the solver cannot use CHOLMOD, which is faster.
         for row in solve_rows(
             solver,
@@ -129,27 +149,28 @@ class FEMLikelihood:
             starts=lambda k: (*nearest(k), self._start(thetas[k])),
         ):
             number, state = divmod(row.number, states)
-            if self.keep and row.converged:
-                self.rows.append(row)
+            field = Field(row.solution.displacement, row.sensitivities)
+            if self.kept is not None and row.converged:
+                self.kept[keys[row.number]] = field
             if number not in solutions:
                 continue
             if not row.converged:
                 del solutions[number]
                 yield number, None
                 continue
-            solutions[number][state] = row
+            solutions[number][state] = field
             if len(solutions[number]) == states:
-                rows = solutions.pop(number)
-                yield number, [rows[k] for k in range(states)]
+                fields = solutions.pop(number)
+                yield number, [fields[k] for k in range(states)]
 
     def _kept_beside(self, thetas: jax.Array) -> Callable[[int], list[jax.Array]]:
         """Return the starts from kept solutions of each of ``thetas`` (c, p), by its number."""
+        if not self.kept:
+            return lambda _: []
         count = len(thetas)
-        fields = {
-            count + k: Field(row.solution.displacement, row.sensitivities)
-            for k, row in enumerate(self.rows)
-        }
-        every = jnp.concatenate([thetas, *(row.theta[None] for row in self.rows)])
+        known = np.array([np.frombuffer(key) for key in self.kept])
+        fields = {count + k: field for k, field in enumerate(self.kept.values())}
+        every = jnp.concatenate([thetas, known])
         return Neighbours(cast(Scene, self.simulator.scene), every, fields)
 
     def _stable(self, fields: list[jax.Array], thetas: jax.Array) -> bool | None:
@@ -167,11 +188,11 @@ class FEMLikelihood:
             self.simulator.is_stable(u, theta) for u, theta in zip(fields, thetas, strict=True)
         )
 
-    def _slopes(self, rows: list[Row], thetas: jax.Array) -> np.ndarray | None:
+    def _slopes(self, solved: list[Field], thetas: jax.Array) -> np.ndarray | None:
         """Return derivatives (m, S, p) of the flat means, by those of the equilibria."""
         nodes = self.model.observe.nodes
-        u = jnp.stack([row.solution.displacement[nodes] for row in rows])
-        du = jnp.stack([row.sensitivities[:, nodes] for row in rows])
+        u = jnp.stack([jnp.asarray(field.displacement)[nodes] for field in solved])
+        du = jnp.stack([jnp.asarray(field.sensitivities)[:, nodes] for field in solved])
         slopes = np.asarray(self._derivatives(u, du, thetas))
         return slopes if np.isfinite(slopes).all() else None
 

@@ -19,6 +19,7 @@ from calibrate.project import (
 )
 from calibrate.statistical_model.fem_likelihood import FEMLikelihood
 from emulator.core.errors import InputError, SolverError
+from emulator.fem.campaign import workers
 from emulator.scenes.built_in import BUILT_IN
 
 BEAM = "once_clamped_beam"
@@ -72,6 +73,30 @@ def test_what_was_saved_is_read_again(folder):
     assert set(run.prior["median"]) == {"mu", "lam"}
     space = {p.name: p for p in posterior.model.forward.scene.parameters}
     assert space["mu"].low < 10.0 < 500.0 < space["mu"].high
+
+
+def test_a_search_that_was_killed_goes_on_to_the_same_posterior(folder, tmp_path, monkeypatch):
+    """What was solved before is not solved again."""
+    solve, solved = workers.Solver.__call__, []
+
+    def stopping(solver, task):
+        if len(solved) == 20:
+            raise KeyboardInterrupt
+        solved.append(task.number)
+        return solve(solver, task)
+
+    monkeypatch.setattr(workers.Solver, "__call__", stopping)
+    with pytest.raises(KeyboardInterrupt):
+        infer(RUN, tmp_path / "r", check_map=False)
+    solved.clear()
+    monkeypatch.setattr(
+        workers.Solver, "__call__", lambda solver, task: solved.append(1) or solve(solver, task)
+    )
+    again = infer(RUN, tmp_path / "r", check_map=False)
+    _, before = read_posterior(folder)
+    assert len(solved) == json.loads(before.tree.attrs["rounds"])[-1]["runs"] - 18
+    np.testing.assert_allclose(again.draws()["mu"], before.draws()["mu"], rtol=1e-6)
+    assert not (tmp_path / "r" / "solutions.safetensors").exists()
 
 
 def test_only_a_scene_without_an_emulator_gets_rounds():
