@@ -45,6 +45,7 @@ from calibrate.posterior.diagnosis import MAP_ERRORS, MAP_MOVES
 from calibrate.posterior.posterior import make_tree
 from calibrate.samplers.modes import MISSED_AT, MISSED_BY
 from calibrate.statistical_model import FEMLikelihood
+from calibrate.statistical_model.correction import Correction
 from calibrate.statistical_model.pool import Pool
 from calibrate.statistical_model.predictive import Predictive
 from emulator.core.display import Stages, counting
@@ -134,9 +135,12 @@ def examine(
             descending = max(round(_DESCENTS * count), min(_FEWEST_DESCENTS, count // 6))
             descents, modes = descend(solver, at_prior, at_draws, z, descending, rng)
         training, total = FEMRuns.joined([at_draws, around, at_prior, descents]), count
+        known = FEMRuns._make(column[:0] for column in at_draws)
+        if taught_at := posterior.taught_at():
+            known = FEMRuns.of_map(predictive, predictive.unconstrain(taught_at))
         with stages("correction, and FEM that tests it"):
             while True:
-                training, pool = _train(solver, z, training, modes, count, most, rng)
+                training, pool = _train(solver, z, training, known, modes, count, most, rng)
                 rows, log_drawn = pool.tests(total - len(training.z), rng)
                 tests = Tests(pool, solver(pool.z[rows], slopes=True), rows, log_drawn)
                 runs = FEMRuns.joined([training, tests.runs])
@@ -149,7 +153,8 @@ def examine(
                 bar.total = total
         bar.close()
         with stages("finer mesh"):
-            change = mesh_change(pool, simulator, runs, mesh, rng, progress=progress)
+            every = FEMRuns.joined([runs, known])
+            change = mesh_change(pool, simulator, every, mesh, rng, progress=progress)
     return Check(judge(replace(evidence, mesh=change)), posterior, tests)
 
 
@@ -179,6 +184,7 @@ def _train(
     solver: FEMRunner,
     z: np.ndarray,
     runs: FEMRuns,
+    known: FEMRuns,
     modes: tuple[np.ndarray, ...],
     count: int,
     most: int,
@@ -187,16 +193,22 @@ def _train(
     """Return all training runs, and the pool under the correction fitted to them.
 
     Of ``count`` runs adaptive ones are a share; the whole check has ``most`` at most.
+
+    known : the runs that the map passes through, to which the correction is fitted, too.
     """
     predictive = solver.predictive
-    correction = correction_from(runs, predictive, most)
+
+    def corrected(runs: FEMRuns) -> Correction:
+        return correction_from(FEMRuns.joined([runs, known]), predictive, most + len(known.z))
+
+    correction = corrected(runs)
     pool = Pool.search(predictive, correction, z, modes, rng)
     for size in _rounds(max(round(_ADAPTIVE * count), 1)):
         chances = tempered(pool.log_explored, MOST_TEMPERED)
         if chances.any():
             points = pool.z[rng.choice(len(pool.z), size=size, p=chances)]
             runs = FEMRuns.joined([runs, solver(points, slopes=True)])
-        pool = pool.corrected_by(correction_from(runs, predictive, most))
+        pool = pool.corrected_by(corrected(runs))
         if effective(normalised(pool.log_explored)) < MOST_TEMPERED:
             pool = pool.stepped(pool.log_explored, rng)
     return runs, pool.polished(rng).redrawn(rng)

@@ -76,6 +76,13 @@ class FEMRuns(NamedTuple):
         return self.fem > least_likely(self.fem.max(), self.z.shape[1], _LIKELY)
 
     @classmethod
+    def of_map(cls, predictive: Predictive, z: np.ndarray) -> FEMRuns:
+        """Return runs at points (s, p) whose solutions the map passes through: its own answers."""
+        _, cheap, means = predictive.by_map(z)
+        slopes = tuple(predictive.slopes(point) for point in z)
+        return cls(z, cheap, means, np.full(len(z), np.nan), (None,) * len(z), slopes)
+
+    @classmethod
     def joined(cls, parts: Iterable[FEMRuns]) -> FEMRuns:
         """Return the runs of all parts, one part after the other."""
         *arrays, stable, slopes = zip(*parts, strict=True)

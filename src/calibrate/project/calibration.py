@@ -13,7 +13,7 @@ from calibrate.certificate import Certificate, examine
 from calibrate.certificate.check import can_reweight, reweighted
 from calibrate.measurements import missing_values
 from calibrate.posterior import Posterior, sample
-from calibrate.posterior.diagnosis import MAP_ERRORS, MAP_MOVES, SCALED_NOISE
+from calibrate.posterior.diagnosis import MAP_ERRORS, MAP_MOVES, SCALED_NOISE, TAUGHT_AT
 from calibrate.project.problem import (
     Problem,
     build_model,
@@ -108,7 +108,8 @@ def infer(
             SECONDS: stages.seconds,
         }  # fmt: skip
         if isinstance(model.full, TaughtEmulator):
-            attributes[ROUNDS_RECORD] = model.full.emulator.record[ROUNDS_RECORD]
+            record = model.full.emulator.record
+            attributes |= {name: record[name] for name in (ROUNDS_RECORD, TAUGHT_AT)}
         posterior.tree.attrs.update(as_attributes(attributes))
         if target is not None:
             save_results(target, problem, posterior)
@@ -161,6 +162,8 @@ def report(run: Run, posterior: Posterior, certificate: Certificate | None) -> d
     for name, row in table.items() if run.is_synthetic else ():
         if (value := run.truth.get(name, run.truth.get(split(name)[0]))) is not None:
             row["truth"] = value
+    for name, owed in posterior.reliance().items():
+        table[name] |= owed._asdict()
     result: dict[str, Any] = {
         "scene": run.scene,
         "forward": run.forward,

@@ -33,6 +33,7 @@ import numpy as np
 from calibrate.certificate.runs import FEMRunner, FEMRuns, correction_from, least_likely
 from calibrate.importance.proposals import key_from
 from calibrate.importance.weights import normalised
+from calibrate.posterior.diagnosis import TAUGHT_AT
 from calibrate.statistical_model import FEMLikelihood, Model
 from calibrate.statistical_model.pool import Pool
 from calibrate.statistical_model.predictive import Predictive
@@ -130,7 +131,10 @@ def teach(
             bar.set_postfix_str(f"log likelihoods missed by {rounds[-1].missed:.2g}")
         bar.close()
     emulator, record = add_discrepancy(Emulator(simulator.scene), _runs_of(kept))
-    record = {"discrepancy": record, ROUNDS_RECORD: [asdict(r) for r in rounds]}
+    at = predictive.constrain(runs.z[runs.converged])
+    taught_at = {name: values.tolist() for name, values in at.items()}
+    rounds_record = {ROUNDS_RECORD: [asdict(r) for r in rounds], TAUGHT_AT: taught_at}
+    record = {"discrepancy": record, **rounds_record}
     return taught(replace(emulator, record=record))
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import emulator as em
+from calibrate.cli import main
 from calibrate.priors import Population
 from calibrate.priors.wide import completed, wide_prior, widened
 from calibrate.project import (
@@ -129,3 +130,28 @@ def test_a_prior_in_which_fem_fails_is_named(monkeypatch):
     )
     with pytest.raises(SolverError, match="FEM fails at 10 of 10 points of the prior"):
         infer(RUN)
+
+
+OWN = """
+mesh = "own.vtu"
+law = "neo_hookean"
+order = 2
+loads = [{kind = "gravity"}]
+supports = [{node_set = "left"}]
+parameters = {mu = {unit = "kPa", range = [50, 100]}, lam = {unit = "kPa", range = [50, 100]}}
+"""
+
+
+def test_one_command_from_a_scene_file_and_data_to_a_verdict(tmp_path, capsys):
+    """Nobody trained anything, and the truth is at three times the end of a range."""
+    em.write_mesh(tmp_path / "own.vtu", em.generators.box((100.0, 10.0, 10.0), (8, 2, 2)))
+    (tmp_path / "own.toml").write_text(OWN)
+    words = ["--truth", "mu=300", "lam=60", "--observe", "nodes:9", "--noise", "1"]
+    run = ["infer", str(tmp_path / "own.toml"), *words, "--draws", "500"]
+    assert main([*run, "--out", str(tmp_path / "r"), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["verdict"] == "accepted"
+    assert result["rounds"][-1]["missed"] < 0.1
+    mu = result["parameters"]["mu"]
+    assert abs(mu["mean"] - 300.0) < 3.0 * mu["sd"] < 90.0
+    assert mu["of_prior"] < 0.2
