@@ -33,6 +33,21 @@ def wide_prior(scene: ForwardProblem, bounded: Collection[str] = ()) -> Populati
     return Population(median, log_sd, source=source)
 
 
+def as_wide(
+    prior: str | Mapping[str, Any], scene: ForwardProblem, bounded: Collection[str]
+) -> tuple[str | dict[str, Any], ForwardProblem]:
+    """Return a run's prior in numbers, wide where it states none, and the scene as wide as it.
+
+    Parameters
+    ----------
+    prior : the run's words or numbers. bounded : the parameters whose range nature ends.
+    """
+    population = completed(population_called(prior), wide_prior(scene, bounded))
+    if population is None:
+        return BOX, scene
+    return asdict(population), widened(with_mesh(scene), population)
+
+
 def completed(stated: Population | None, wide: Population | None) -> Population | None:
     """Return the population of ``stated`` parameters, and of all others that ``wide`` has."""
     if stated is None or wide is None:
@@ -42,15 +57,9 @@ def completed(stated: Population | None, wide: Population | None) -> Population 
 
 def widened(scene: Scene, prior: Population) -> Scene:
     """Return ``scene`` with ranges that hold all but 2e-4 of a prior's mass of each parameter."""
-
-    def range_of(name: str) -> tuple[float, float]:
-        step = float(np.exp(_WIDTH * prior.log_sd[name]))
-        return prior.median[name] / step, prior.median[name] * step
-
-    parameters = []
-    for parameter in scene.parameters:
-        if parameter.name in prior.median:
-            low, high = range_of(parameter.name)
-            parameter = replace(parameter, low=low, high=high, scale="log")
-        parameters.append(parameter)
+    parameters = list(scene.parameters)
+    for k, parameter in enumerate(parameters):
+        if (median := prior.median.get(parameter.name)) is not None:
+            step = float(np.exp(_WIDTH * prior.log_sd[parameter.name]))
+            parameters[k] = replace(parameter, low=median / step, high=median * step, scale="log")
     return replace(scene, parameters=tuple(parameters))

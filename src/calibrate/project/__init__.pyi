@@ -2,13 +2,13 @@ from .calibration import certify_and_keep, infer, report
 from .problem import (
     Problem,
     by_fem,
-    by_rounds,
     make_data,
     model_before_data,
     read_problem,
     simulator_of,
 )
 from .results import holds_population, load, read_posterior
+from .rounds import by_rounds
 from .run import Run
 
 __all__ = [

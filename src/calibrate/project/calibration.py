@@ -10,14 +10,13 @@ from typing import Any, cast
 import numpy as np
 
 from calibrate.certificate import Certificate, examine
-from calibrate.certificate.check import can_reweight, reweighted
+from calibrate.certificate.reweighting import can_reweight, reweighted
 from calibrate.measurements import missing_values
 from calibrate.posterior import Posterior, sample
-from calibrate.posterior.diagnosis import MAP_ERRORS, MAP_MOVES, SCALED_NOISE, TAUGHT_AT
+from calibrate.posterior.diagnosis import MAP_ERRORS, MAP_MOVES, SCALED_NOISE
 from calibrate.project.problem import (
     Problem,
     build_model,
-    by_rounds,
     read_problem,
     simulator_of,
     with_data,
@@ -31,7 +30,7 @@ from calibrate.project.results import (
     save_results,
     save_reweighted,
 )
-from calibrate.project.rounds import ROUNDS_RECORD
+from calibrate.project.rounds import ROUNDS_RECORD, account_of, by_rounds, taught_map
 from calibrate.project.run import Run
 from calibrate.provenance import as_attributes
 from calibrate.state_names import split
@@ -42,7 +41,6 @@ from emulator.core.store import write_json
 from emulator.fem import Simulator
 from emulator.scenes.scene import Scene
 from emulator.surrogates.fem import FEMForward
-from emulator.surrogates.taught import TaughtEmulator
 
 NOT_CERTIFIED = "not certified"
 SECONDS = "seconds"  # attribute of a posterior: the seconds of each stage, as JSON
@@ -79,12 +77,13 @@ def infer(
             "population, and calibrate.hierarchy their models"
         )
     target, stages = None if folder is None else Path(folder), Stages(show=progress)
+    checkpoint, solutions = (target and target / name for name in (SAMPLING, SOLUTIONS))
     with nullcontext() if target is None else reserved(target, force=force):
         with stages("scene and data"):
             problem = with_data(by_rounds(read_problem(run)))
         with stages("forward map and model"):
-            keep = None if target is None else target / SOLUTIONS
-            model, data = build_model(problem, keep=keep, progress=progress)
+            forward = taught_map(problem, solutions, progress=progress)
+            model, data = build_model(problem, forward, progress=progress)
         sampler, options = problem.run.sampling()
         with stages("sampling"):
             posterior = sample(
@@ -94,7 +93,7 @@ def infer(
                 options=options,
                 seed=problem.run.seed,
                 progress=progress,
-                checkpoint=None if target is None else target / SAMPLING,
+                checkpoint=checkpoint,
             )
         errors = NOT_ASKED
         # The states of a specimen, which has no mesh, are solved, not learned.
@@ -103,17 +102,14 @@ def infer(
             with stages("check of the map"):
                 simulator = cast(Simulator, problem.simulator)
                 errors = map_errors(posterior.model, simulator, posterior.draws(), posterior.data)
-        attributes: dict[str, Any] = {
+        attributes = {
             SCALED_NOISE: problem.scaled_noise, MAP_ERRORS: errors.sizes, MAP_MOVES: errors.moves,
-            SECONDS: stages.seconds,
+            SECONDS: stages.seconds, **account_of(model.full),
         }  # fmt: skip
-        if isinstance(model.full, TaughtEmulator):
-            record = model.full.emulator.record
-            attributes |= {name: record[name] for name in (ROUNDS_RECORD, TAUGHT_AT)}
         posterior.tree.attrs.update(as_attributes(attributes))
         if target is not None:
             save_results(target, problem, posterior)
-            (target / SOLUTIONS).unlink(missing_ok=True)
+            target.joinpath(SOLUTIONS).unlink(missing_ok=True)
     return posterior
 
 

@@ -10,9 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import Any, cast
+from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,9 +21,7 @@ from calibrate.measurements import Observations, parse_observation
 from calibrate.measurements.data import read_measurements
 from calibrate.measurements.usual_noise import size_in, usual_noise
 from calibrate.priors import prior_of
-from calibrate.priors.population import population_called
-from calibrate.priors.wide import completed, wide_prior, widened
-from calibrate.project.rounds import teach
+from calibrate.priors.wide import as_wide
 from calibrate.project.run import Run
 from calibrate.state_names import split
 from calibrate.statistical_model import Model, with_error
@@ -38,9 +35,8 @@ from emulator.core.rooms import offered
 from emulator.fem import NewtonOptions, Simulator
 from emulator.fem.solution import EquilibriumSolver
 from emulator.scenes.forward_problem import ForwardProblem
-from emulator.scenes.scene import Scene, with_mesh
-from emulator.surrogates import registry, shipped
-from emulator.surrogates.emulator import EMULATOR, Emulator
+from emulator.scenes.scene import Scene
+from emulator.surrogates import registry
 from emulator.surrogates.fem import by_solver
 from emulator.surrogates.protocol import ForwardMap, Ingredients
 from emulator.surrogates.taught import ROUNDS
@@ -128,7 +124,9 @@ def read_problem(
         if scene is None:
             scene = find_problem(run.scene, run.root)
             table = scene.table
-        run, scene = as_wide(run, scene)
+        if run.forward == ROUNDS.name:
+            prior, scene = as_wide(run.prior, scene, run.bounded)
+            run = replace(run, prior=prior)
         if run.is_synthetic:
             names = {**run.known, **run.truth}
             states = tuple(dict.fromkeys(state for _, state in map(split, names) if state))
@@ -150,37 +148,6 @@ def read_problem(
             words = dict.fromkeys(str(description["of"]).split("+"))
             observe.expand(words, f"systematic '{name}': of")
         return Problem(run, scene, observe, data)
-
-
-def as_wide(run: Run, scene: ForwardProblem) -> tuple[Run, ForwardProblem]:
-    """Return a run and its scene; for a map that is taught, with a wide prior, and as wide as it.
-
-    The prior is then in numbers: those that the run states, and of other parameters log-normals
-    from the scene's ranges (:func:`calibrate.priors.wide.wide_prior`).
-    """
-    if run.forward != ROUNDS.name:
-        return run, scene
-    population = completed(population_called(run.prior), wide_prior(scene, run.bounded))
-    if population is None:
-        return run, scene
-    return replace(run, prior=asdict(population)), widened(with_mesh(scene), population)
-
-
-def by_rounds(problem: Problem) -> Problem:
-    """Return the problem with a map that is taught where its scene has no emulator.
-
-    A run that names a forward map or an emulator is returned as it is.
-    """
-    run, scene = problem.run, problem.scene
-    taught = (
-        run.forward == EMULATOR.name
-        and run.emulator is None
-        and isinstance(scene, Scene)
-        and scene.name not in shipped()
-    )
-    if not taught:
-        return problem
-    return read_problem(replace(run, forward=ROUNDS.name), scene=scene)
 
 
 @contextmanager
@@ -263,19 +230,19 @@ def model_before_data(run: Run | Problem, *, progress: bool = False) -> Model:
 
 
 def build_model(
-    problem: Problem, *, keep: Path | None = None, progress: bool = False
+    problem: Problem, forward: ForwardMap | None = None, *, progress: bool = False
 ) -> tuple[Model, Mapping[str, Any]]:
     """Return the statistical model of a problem with data, and the data that it is sampled with.
 
-    keep : the file of FEM's solutions while a map is taught by rounds.
+    forward : a forward map over all nodes; by default the one that the run names.
     """
     run = problem.run
     assert problem.data is not None, "with_data comes first"
-    if run.forward == ROUNDS.name:
-        forward: ForwardMap = _taught(problem, keep, progress=progress)
-    else:
-        forward = build_forward(problem, progress=progress)
-    run_model, data = _with_errors(problem, forward)
+    data: Mapping[str, Any] = problem.data
+    forward = build_forward(problem, progress=progress) if forward is None else forward
+    run_model = model_of(run, forward, problem.observe)
+    if run.systematic:
+        run_model, data = with_described_errors(run_model, data, run.systematic)
     if runs := run.error_runs or run.mesh_error_runs:
         run_model, data = run_model.given(data)
         run_model = with_error(
@@ -287,27 +254,6 @@ def build_model(
             progress=progress,
         )
     return run_model, data
-
-
-def _with_errors(problem: Problem, forward: ForwardMap) -> tuple[Model, Mapping[str, Any]]:
-    """Return the model with systematic errors, if the run has any, and the data it is of."""
-    assert problem.data is not None, "with_data comes first"
-    run_model = model_of(problem.run, forward, problem.observe)
-    if not problem.run.systematic:
-        return run_model, problem.data
-    return with_described_errors(run_model, problem.data, problem.run.systematic)
-
-
-def _taught(problem: Problem, keep: Path | None, *, progress: bool) -> ForwardMap:
-    """Return the map that rounds of FEM runs teach, from the body at rest."""
-    scene = with_mesh(problem.scene)
-    model, data = _with_errors(problem, Emulator(scene).cache())
-    model, data = replace(model, check_scale=False).given(data)
-    most = registry.full_options(ROUNDS.name, problem.run.forward_options)["most_runs"]
-    simulator = cast(Simulator, problem.simulator)
-    return teach(
-        model, data, simulator, most=most, seed=problem.run.seed, keep=keep, progress=progress
-    )
 
 
 def by_fem(model: Model, load_steps: int = 1) -> Model:

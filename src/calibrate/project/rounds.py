@@ -24,7 +24,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -34,6 +34,7 @@ from calibrate.certificate.runs import FEMRunner, FEMRuns, correction_from, leas
 from calibrate.importance.proposals import key_from
 from calibrate.importance.weights import normalised
 from calibrate.posterior.diagnosis import TAUGHT_AT
+from calibrate.project.problem import Problem, build_model, read_problem
 from calibrate.statistical_model import FEMLikelihood, Model
 from calibrate.statistical_model.pool import Pool
 from calibrate.statistical_model.predictive import Predictive
@@ -43,9 +44,12 @@ from emulator.core.machine import one_blas_thread
 from emulator.core.store import read_arrays, save_arrays
 from emulator.fem import Simulator
 from emulator.fem.campaign import Field, Runs
+from emulator.scenes.scene import Scene, with_mesh
+from emulator.surrogates import registry, shipped
 from emulator.surrogates.discrepancy import maximin_subset
-from emulator.surrogates.emulator import Emulator
-from emulator.surrogates.taught import TaughtEmulator, taught
+from emulator.surrogates.emulator import EMULATOR, Emulator
+from emulator.surrogates.protocol import ForwardMap
+from emulator.surrogates.taught import ROUNDS, TaughtEmulator, taught
 from emulator.training.mechanics import add_discrepancy
 
 ROUNDS_RECORD = "rounds"
@@ -117,12 +121,7 @@ def teach(
             return answers
 
         runs = ask(_spread_over_prior(predictive, min(_BEGIN, most), rng))
-        failed = int((~runs.converged).sum())
-        if failed > 0.5 * len(runs.z):
-            raise SolverError(
-                f"FEM fails at {failed} of {len(runs.z)} points of the prior; narrow it, or raise "
-                "--load-steps"
-            )
+        _require_half(runs)
         while len(runs.z) < most and not _are_foreseen(rounds):
             fresh, predicted, drawn = _fresh_points(predictive, runs, most, rng)
             answers = ask(fresh[: most - len(runs.z)])
@@ -136,6 +135,54 @@ def teach(
     rounds_record = {ROUNDS_RECORD: [asdict(r) for r in rounds], TAUGHT_AT: taught_at}
     record = {"discrepancy": record, **rounds_record}
     return taught(replace(emulator, record=record))
+
+
+def by_rounds(problem: Problem) -> Problem:
+    """Return the problem with a map that is taught where its scene has no emulator.
+
+    A run that names a forward map or an emulator is returned as it is.
+    """
+    run, scene = problem.run, problem.scene
+    named = run.forward != EMULATOR.name or run.emulator is not None
+    if named or not isinstance(scene, Scene) or scene.name in shipped():
+        return problem
+    return read_problem(replace(run, forward=ROUNDS.name), scene=scene)
+
+
+def taught_map(
+    problem: Problem, keep: Path | None = None, *, progress: bool = False
+) -> TaughtEmulator | None:
+    """Return the map that rounds of FEM runs teach; None where the run names another one.
+
+    keep : the file of FEM's solutions, as of :func:`teach`.
+    """
+    run = problem.run
+    if run.forward != ROUNDS.name:
+        return None
+    at_rest = Emulator(with_mesh(problem.scene)).cache()
+    bare = replace(problem, run=replace(run, error_runs=0, mesh_error_runs=0))
+    model, data = build_model(bare, at_rest)
+    model, data = replace(model, check_scale=False).given(data)
+    most = registry.full_options(ROUNDS.name, run.forward_options)["most_runs"]
+    simulator = cast(Simulator, problem.simulator)
+    return teach(model, data, simulator, most=most, seed=run.seed, keep=keep, progress=progress)
+
+
+def account_of(forward: ForwardMap) -> dict[str, Any]:
+    """Return the rounds, and the draws at which FEM was solved, of a map that they taught."""
+    if not isinstance(forward, TaughtEmulator):
+        return {}
+    return {name: forward.emulator.record[name] for name in (ROUNDS_RECORD, TAUGHT_AT)}
+
+
+def _require_half(runs: FEMRuns) -> None:
+    """Raise :class:`SolverError` where FEM fails at most of the prior."""
+    failed = int((~runs.converged).sum())
+    if failed > 0.5 * len(runs.z):
+        raise SolverError(
+            f"FEM fails at {failed} of {len(runs.z)} points of the prior; narrow it, or raise "
+            "--load-steps"
+        )
 
 
 def _are_foreseen(rounds: list[Round]) -> bool:

@@ -214,7 +214,7 @@ def _fitted(
         regression = Regression.of(kernel + nugget * np.diag(noise))
         inverse, weights = regression.inverse(), regression.weights(y)
         # Errors of runs left out, in noise sd, and their variances up to a^2.
-        left_out = [np.linalg.solve(inverse[np.ix_(b, b)], np.eye(len(b), 1)) for b in blocks]
+        left_out = [Regression.of(inverse[np.ix_(b, b)]).weights(np.eye(len(b), 1)) for b in blocks]
         variance = np.array([column[0, 0] for column in left_out])
         error = np.array([c[:, 0] @ weights[b] for c, b in zip(left_out, blocks, strict=True)])
         square = np.mean((error / scales) ** 2, axis=1)

@@ -54,7 +54,7 @@ def _to_arrays(forward: ForwardMap) -> Arrays:
 
 def _from_arrays(scene: Scene, arrays: Arrays) -> TaughtEmulator:
     present = {name: inside(arrays, name) for name in PARTS}
-    parts = {n: PARTS[n].restore(scene, {}, own) for n, own in present.items() if own}
+    parts = {n: PARTS[n].restore(scene, {}, part) for n, part in present.items() if part}
     return taught(Emulator(scene, **parts))  # type: ignore[arg-type]
 
 
