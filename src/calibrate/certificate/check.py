@@ -124,9 +124,8 @@ def examine(
             descending = max(round(_DESCENTS * count), min(_FEWEST_DESCENTS, count // 6))
             descents, modes = descend(solver, at_prior, at_draws, z, descending, rng)
         training, total = FEMRuns.joined([at_draws, around, at_prior, descents]), count
-        known = FEMRuns._make(column[:0] for column in at_draws)
-        if taught_at := posterior.taught_at():
-            known = FEMRuns.of_map(predictive, predictive.unconstrain(taught_at))
+        taught_at = posterior.taught_at()
+        known = [FEMRuns.of_map(predictive, predictive.unconstrain(taught_at))] if taught_at else []
         with stages("correction, and FEM that tests it"):
             while True:
                 training, pool = _train(solver, z, training, known, modes, count, most, rng)
@@ -142,7 +141,7 @@ def examine(
                 bar.total = total
         bar.close()
         with stages("finer mesh"):
-            every = FEMRuns.joined([runs, known])
+            every = FEMRuns.joined([runs, *known])
             change = mesh_change(pool, simulator, every, mesh, rng, progress=progress)
     return Check(judge(replace(evidence, mesh=change)), posterior, tests)
 
@@ -173,7 +172,7 @@ def _train(
     solver: FEMRunner,
     z: np.ndarray,
     runs: FEMRuns,
-    known: FEMRuns,
+    known: list[FEMRuns],
     modes: tuple[np.ndarray, ...],
     count: int,
     most: int,
@@ -183,15 +182,15 @@ def _train(
 
     Of ``count`` runs adaptive ones are a share; the whole check has ``most`` at most.
 
-    known : the runs that the map passes through, to which the correction is fitted, too.
+    known : runs that the map passes through; the correction is fitted to them, too.
     """
     predictive = solver.predictive
 
     def corrected(runs: FEMRuns) -> Correction:
-        return correction_from(FEMRuns.joined([runs, known]), predictive, most + len(known.z))
+        every = FEMRuns.joined([runs, *known])
+        return correction_from(every, predictive, most + len(every.z) - len(runs.z))
 
-    correction = corrected(runs)
-    pool = Pool.search(predictive, correction, z, modes, rng)
+    pool = Pool.search(predictive, corrected(runs), z, modes, rng)
     for size in _rounds(max(round(_ADAPTIVE * count), 1)):
         chances = tempered(pool.log_explored, MOST_TEMPERED)
         if chances.any():

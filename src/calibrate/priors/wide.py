@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import replace
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, replace
+from typing import Any
 
 import numpy as np
 
-from calibrate.priors.population import Population
+from calibrate.priors.population import BOX, Population, population_called
 from emulator.scenes.forward_problem import ForwardProblem
-from emulator.scenes.scene import Scene
+from emulator.scenes.scene import Scene, with_mesh
 
 _LEAST_LOG_SD = float(np.log(2.0))
 _WIDTH = 3.72  # sd to each side of a median that hold all but 2e-4 of the mass

@@ -125,8 +125,8 @@ def read_problem(
             scene = find_problem(run.scene, run.root)
             table = scene.table
         if run.forward == ROUNDS.name:
-            prior, scene = as_wide(run.prior, scene, run.bounded)
-            run = replace(run, prior=prior)
+            wide, scene = as_wide(run.prior, scene, run.bounded)
+            run = replace(run, prior=wide)
         if run.is_synthetic:
             names = {**run.known, **run.truth}
             states = tuple(dict.fromkeys(state for _, state in map(split, names) if state))
