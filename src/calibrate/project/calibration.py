@@ -131,7 +131,7 @@ def certify_and_keep(
     folder : the folder of the posterior.
     load_steps : load steps of every solve.
     reweight_to : the folder that the reweighted posterior is written to, ready to be certified in
-        its turn, where the verdict allows it (:func:`calibrate.certificate.reweighting.can_reweight`).
+        its turn, where the verdict allows it.
     progress : whether progress bars, and the seconds of each stage, are shown.
     options : the numbers of FEM runs, and where they are solved, as of
         :func:`calibrate.certificate.examine`, with its errors.
