@@ -4,7 +4,8 @@
 rest on :func:`examine`, which solves FEM a fixed number of times.
 """
 
-from calibrate.certificate.check import Check, certify, examine, reweight
+from calibrate.certificate.check import Check, certify, examine
+from calibrate.certificate.reweighting import reweight
 from calibrate.certificate.verdict import Certificate, Verdict, judge
 
 __all__ = ["Certificate", "Check", "Verdict", "certify", "examine", "judge", "reweight"]

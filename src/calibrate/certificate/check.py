@@ -26,12 +26,9 @@ however good or bad the correction is, and small where it is good.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from calibrate.certificate.estimates import Tests, evidence_of
@@ -41,10 +38,8 @@ from calibrate.certificate.verdict import Certificate, judge
 from calibrate.importance.proposals import MOST_TEMPERED, Kernels, key_from, tempered
 from calibrate.importance.weights import effective, normalised
 from calibrate.posterior import Posterior
-from calibrate.posterior.diagnosis import MAP_ERRORS, MAP_MOVES
-from calibrate.posterior.posterior import make_tree
-from calibrate.samplers.modes import MISSED_AT, MISSED_BY
 from calibrate.statistical_model import FEMLikelihood
+from calibrate.statistical_model.correction import Correction
 from calibrate.statistical_model.pool import Pool
 from calibrate.statistical_model.predictive import Predictive
 from emulator.core.display import Stages, counting
@@ -59,11 +54,6 @@ _AT_DRAWS, _AROUND, _AT_PRIOR, _DESCENTS, _ADAPTIVE = 0.15, 0.1, 0.1, 0.08, 0.12
 _FEWEST_DESCENTS = 16  # runs with which descents reach an end
 _ROUNDS = 5  # rounds of adaptive runs
 _STABILITY = 20  # draws at which the sign of the tangent is examined
-_CHAINS = 4  # chains of a reweighted posterior
-_OF_OTHER_DRAWS = (
-    "log_evidence", "log_evidence_error", "pareto_k", "importance_efficiency", MISSED_BY, MISSED_AT,
-    MAP_ERRORS, MAP_MOVES, "weights_pareto_k", "evaluations", "effective_points",
-)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,22 +113,24 @@ def examine(
         solver = FEMRunner(predictive, FEMLikelihood(posterior.model, simulator), bar)
         with stages("FEM where the map was asked"):
             rows = np.linspace(0, len(z) - 1, max(round(_AT_DRAWS * count), 5)).astype(int)
-            at_draws = solver(z[rows], stability=_STABILITY)
+            at_draws = solver(z[rows], stability=_STABILITY, slopes=True)
             # Next to the draws the map may hide a part of the posterior, by an error that draws of
             # the prior are too far apart to show.
             surroundings = Kernels.surrounding(z, rng).sample(rng, max(round(_AROUND * count), 4))
-            around = solver(surroundings)
+            around = solver(surroundings, slopes=True)
             prior = predictive.prior_draws(key_from(rng), max(round(_AT_PRIOR * count), 4))
             at_prior = solver(prior, slopes=True)
             # Only descents of FEM's own misfit lead to a mode that the map hides altogether.
             descending = max(round(_DESCENTS * count), min(_FEWEST_DESCENTS, count // 6))
             descents, modes = descend(solver, at_prior, at_draws, z, descending, rng)
         training, total = FEMRuns.joined([at_draws, around, at_prior, descents]), count
+        taught_at = posterior.taught_at()
+        known = [FEMRuns.of_map(predictive, predictive.unconstrain(taught_at))] if taught_at else []
         with stages("correction, and FEM that tests it"):
             while True:
-                training, pool = _train(solver, z, training, modes, count, most, rng)
+                training, pool = _train(solver, z, training, known, modes, count, most, rng)
                 rows, log_drawn = pool.tests(total - len(training.z), rng)
-                tests = Tests(pool, solver(pool.z[rows]), rows, log_drawn)
+                tests = Tests(pool, solver(pool.z[rows], slopes=True), rows, log_drawn)
                 runs = FEMRuns.joined([training, tests.runs])
                 evidence = evidence_of(posterior, at_draws, training, tests, len(modes), rng)
                 count = _further_runs(total, most)
@@ -149,7 +141,8 @@ def examine(
                 bar.total = total
         bar.close()
         with stages("finer mesh"):
-            change = mesh_change(pool, simulator, runs, mesh, rng, progress=progress)
+            every = FEMRuns.joined([runs, *known])
+            change = mesh_change(pool, simulator, every, mesh, rng, progress=progress)
     return Check(judge(replace(evidence, mesh=change)), posterior, tests)
 
 
@@ -179,6 +172,7 @@ def _train(
     solver: FEMRunner,
     z: np.ndarray,
     runs: FEMRuns,
+    known: list[FEMRuns],
     modes: tuple[np.ndarray, ...],
     count: int,
     most: int,
@@ -187,16 +181,22 @@ def _train(
     """Return all training runs, and the pool under the correction fitted to them.
 
     Of ``count`` runs adaptive ones are a share; the whole check has ``most`` at most.
+
+    known : runs that the map passes through; the correction is fitted to them, too.
     """
     predictive = solver.predictive
-    correction = correction_from(runs, predictive, most)
-    pool = Pool.search(predictive, correction, z, modes, rng)
+
+    def corrected(runs: FEMRuns) -> Correction:
+        every = FEMRuns.joined([runs, *known])
+        return correction_from(every, predictive, most + len(every.z) - len(runs.z))
+
+    pool = Pool.search(predictive, corrected(runs), z, modes, rng)
     for size in _rounds(max(round(_ADAPTIVE * count), 1)):
         chances = tempered(pool.log_explored, MOST_TEMPERED)
         if chances.any():
             points = pool.z[rng.choice(len(pool.z), size=size, p=chances)]
-            runs = FEMRuns.joined([runs, solver(points)])
-        pool = pool.corrected_by(correction_from(runs, predictive, most))
+            runs = FEMRuns.joined([runs, solver(points, slopes=True)])
+        pool = pool.corrected_by(corrected(runs))
         if effective(normalised(pool.log_explored)) < MOST_TEMPERED:
             pool = pool.stepped(pool.log_explored, rng)
     return runs, pool.polished(rng).redrawn(rng)
@@ -217,58 +217,3 @@ def _further_runs(total: int, most: int) -> int:
     if most - total - count < _FEWEST:
         count = most - total
     return count if count >= _FEWEST else 0
-
-
-def reweight(
-    posterior: Posterior, simulator: EquilibriumSolver, *, seed: int = 0, **options: Any
-) -> Posterior:
-    """Return FEM's posterior in place of ``posterior``, checked as by :func:`examine`.
-
-    Raises
-    ------
-    InputError
-        As :func:`examine`; or the verdict is neither ``accepted`` nor ``reweight``, so that nothing
-        says the reweighted posterior is FEM's.
-    """
-    check_arguments(options, "reweight", examine)
-    return reweighted(examine(posterior, simulator, seed=seed, **options), seed=seed)
-
-
-def can_reweight(certificate: Certificate) -> bool:
-    """Return whether the reweighted posterior is FEM's, as far as the check can tell."""
-    return certificate.verdict in ("accepted", "reweight")
-
-
-def reweighted(check: Check, *, seed: int = 0) -> Posterior:
-    """Return the corrected map's posterior as 4 chains of independent draws.
-
-    They are resampled from the pool, 1000 draws or as many as the pool has effective points,
-    whichever is less; equal ones occur. Their number and the verdict are in the attributes
-    ``reweighted``. Log likelihoods and replicated data are of the corrected map's data.
-
-    Raises
-    ------
-    InputError
-        The verdict is neither ``accepted`` nor ``reweight``.
-    """
-    verdict = check.certificate.verdict
-    if not can_reweight(check.certificate):
-        raise InputError(
-            f"reweight: the verdict is '{verdict}' ({check.certificate.reason}); a reweighted "
-            "posterior needs 'reweight' or 'accepted'"
-        )
-    pool, predictive, source = check.pool, check.pool.predictive, check.posterior
-    points = effective(pool.corrected)
-    shape = (_CHAINS, int(min(points, 1000.0) // _CHAINS))
-    rows = pool.resampled(shape[0] * shape[1], np.random.default_rng([seed, 1]))
-    by_name = predictive.constrain(pool.z[rows])
-    draws = {name: by_name[name].reshape(shape) for name in source.model.names}
-    statistics = {"lp": (pool.at.prior + pool.at.corrected)[rows].reshape(shape)}
-    flat = jnp.asarray(predictive.corrected_means(pool.z[rows], pool.correction))
-    means = jax.vmap(jax.vmap(predictive.by_name))(flat.reshape(*shape, -1))
-    means = jax.tree.map(np.asarray, means)
-    tree = make_tree(source.model, source.data, draws, statistics, jax.random.key(seed), means)
-    attributes = {n: a for n, a in source.tree.attrs.items() if n not in _OF_OTHER_DRAWS}
-    tree.attrs.update(attributes)
-    tree.attrs["reweighted"] = json.dumps({"verdict": verdict, "effective_points": points})
-    return Posterior(tree, source.model, source.data)

@@ -39,9 +39,10 @@ from calibrate.importance.proposals import key_from
 from calibrate.importance.weights import effective, normalised, pareto_shape
 from calibrate.posterior import Posterior
 from calibrate.posterior.diagnosis import Misfit, Sampling, places_of
+from calibrate.statistical_model.correction import Correction
 from calibrate.statistical_model.errors import in_noise_sd
 from calibrate.statistical_model.pool import Pool
-from calibrate.statistical_model.predictive import Correction, Predictive
+from calibrate.statistical_model.predictive import Predictive
 
 GROUPS = 25
 _DRAWS = 1000  # draws of the posterior predictive check

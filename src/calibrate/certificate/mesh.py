@@ -31,15 +31,15 @@ from calibrate.certificate.evidence import (
     all_within,
 )
 from calibrate.certificate.runs import FEMRuns
-from calibrate.statistical_model.finer_fem import FinerFEM, MeshPair, finer_fem
-from calibrate.statistical_model.pool import Pool
-from calibrate.statistical_model.predictive import (
+from calibrate.statistical_model.correction import (
     Correction,
-    Predictive,
     corrections,
     fit_correction,
     no_correction,
 )
+from calibrate.statistical_model.finer_fem import FinerFEM, MeshPair, finer_fem
+from calibrate.statistical_model.pool import Pool
+from calibrate.statistical_model.predictive import Predictive
 from emulator.accuracy.mesh_error import MeshErrorEstimate
 from emulator.core.display import counting
 from emulator.core.errors import InputError, SolverError

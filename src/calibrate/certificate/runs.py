@@ -26,14 +26,9 @@ from scipy.linalg import eigh
 from scipy.special import chdtri
 from tqdm import tqdm
 
+from calibrate.statistical_model.correction import Correction, fit_correction, no_correction
 from calibrate.statistical_model.fem_likelihood import FEMLikelihood, Likelihoods
-from calibrate.statistical_model.predictive import (
-    Correction,
-    Predictive,
-    fit_correction,
-    gauss_newton_step,
-    no_correction,
-)
+from calibrate.statistical_model.predictive import Predictive, gauss_newton_step
 
 ROUNDS = 4  # runs of a descent
 _LIKELY = 0.999  # mass of the Gaussian at the best run in which a point counts as likely
@@ -79,6 +74,13 @@ class FEMRuns(NamedTuple):
     def likely(self) -> np.ndarray:
         """Whether FEM finds the data as likely as near the best run, (s,)."""
         return self.fem > least_likely(self.fem.max(), self.z.shape[1], _LIKELY)
+
+    @classmethod
+    def of_map(cls, predictive: Predictive, z: np.ndarray) -> FEMRuns:
+        """Return runs at points (s, p) whose solutions the map passes through: its own answers."""
+        _, cheap, means = predictive.by_map(z)
+        slopes = tuple(predictive.slopes(point) for point in z)
+        return cls(z, cheap, means, np.full(len(z), np.nan), (None,) * len(z), slopes)
 
     @classmethod
     def joined(cls, parts: Iterable[FEMRuns]) -> FEMRuns:
@@ -134,14 +136,24 @@ class FEMRunner:
 
 
 def correction_from(runs: FEMRuns, predictive: Predictive, rows: int) -> Correction:
-    """Return the correction fitted to ``runs``, padded to ``rows`` points."""
+    """Return the correction fitted to ``runs`` and their slopes, padded to ``rows`` points."""
     means, valid = predictive.means(runs.z)
     x = predictive.features(runs.z)
     usable = valid & runs.converged
     if usable.sum() < x.shape[1] + 2:
         return no_correction(rows, x.shape[1], means.shape[1])
-    errors = (runs.means - means)[usable]
-    return fit_correction(x[usable], errors, predictive.scales, rows, runs.likely[usable])
+    errors, slopes = (runs.means - means)[usable], None
+    if any(runs.slopes[k] is not None for k in np.flatnonzero(usable)):
+        missing = np.full((x.shape[1], means.shape[1]), np.nan)
+        slopes = np.array(
+            [
+                missing if of_fem is None else predictive.error_slopes(runs.z[k], of_fem)
+                for k, of_fem in enumerate(runs.slopes)
+                if usable[k]
+            ]
+        )
+    likely = runs.likely[usable]
+    return fit_correction(x[usable], errors, predictive.scales, rows, likely, slopes=slopes)
 
 
 @dataclass(frozen=True, eq=False)

@@ -57,12 +57,20 @@ def posterior_summary(report: Mapping[str, Any]) -> str:
     titles = ["mean", "sd", "5 %", "95 %", "R-hat", "ESS"]
     if any("truth" in row for row in parameters.values()):
         columns, titles = ["truth", *columns], ["truth", *titles]
+    of_prior = any("of_prior" in row for row in parameters.values())
+    if of_prior:
+        columns, titles = [*columns, "of_prior", "move"], [*titles, "of prior", "if wider"]
     shifts_by_judge = shifts(report.get("certificate", {}))
     rows = []
     for name, row in parameters.items():
         cells: list[object] = [row.get(column) for column in columns]
         rows.append((name, *cells, *(shift.get(name) for shift in shifts_by_judge.values())))
     lines = [table(("parameter", *titles, *(f"{judge}/sd" for judge in shifts_by_judge)), rows)]
+    if of_prior:
+        lines.append(
+            "of prior: log sd over the prior's; if wider: how far a prior of twice the log sd "
+            "would move the mean, in sd"
+        )
     if shifts_by_judge:
         finer = "FEM between the grips" if "grips" in shifts_by_judge else "a finer mesh"
         judges = ", ".join(shifts_by_judge)
@@ -71,6 +79,11 @@ def posterior_summary(report: Mapping[str, Any]) -> str:
         f"{report['chains']} chains x {report['draws']} draws, {report['divergences']} divergences"
         f", forward map: {report['forward']}"
     )
+    for last in report.get("rounds", [])[-1:]:
+        lines.append(
+            f"map: {last['runs']} FEM runs where the posterior is, in {len(report['rounds'])} "
+            f"rounds; log likelihoods of the last were foreseen to {last['missed']:.2g}"
+        )
     for name, mass in report.get("prior_cut", {}).items():
         lines.append(f"prior of {name} cut to its range: {100.0 * mass:.2g} % of its mass")
     for name, count in report.get("missing", {}).items():

@@ -40,6 +40,7 @@ from emulator.surrogates.registry import FORWARD_MAPS
 MAP_ERRORS, SCALED_NOISE = "map_errors", "scaled_noise"
 MAP_MOVES = "map_moves"  # a number: the largest move of a mean by FEM in the map's place, in sd
 
+TAUGHT_AT = "taught_at"  # draws by name, as JSON, at which FEM has taught the map
 SMALLEST_P = 0.005
 OUTLYING = 4.0  # sds, beyond which 0.6 % of sets of 100 Gaussian data have a datum
 LARGEST_MAP_ERROR = 0.5  # noise sd by which the forward map may miss FEM's data

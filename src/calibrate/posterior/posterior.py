@@ -5,6 +5,7 @@ Groups of the DataTree have ArviZ's names, so that ArviZ works on the saved file
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,7 +21,15 @@ from calibrate.measurements import Observation, missing_values
 from calibrate.measurements.labels import labels_of
 from calibrate.posterior import predictions
 from calibrate.posterior.box import BoxEnd, box_ends
-from calibrate.posterior.diagnosis import Summary, diagnose, misfits, nothing_learned, summary_of
+from calibrate.posterior.diagnosis import (
+    TAUGHT_AT,
+    Summary,
+    diagnose,
+    misfits,
+    nothing_learned,
+    summary_of,
+)
+from calibrate.posterior.reliance import Reliance, reliance_of, rests_on_prior
 from calibrate.posterior.taken_up import TakenUp, sentences, taken_up
 from calibrate.provenance import as_attributes, versions
 from calibrate.samplers import check_options, density_of, find_sampler, named_draws
@@ -137,11 +146,21 @@ class Posterior(TableRepr):
             }
             noise = ", ".join(f"{sd} of {name}" for name, sd in sds.items())
             faults += nothing_learned(self.tree, model.states.unknowns, noise)
-        return [*faults, *misfits(self.tree), *sentences(self.inferred_noise())]
+        on_prior = rests_on_prior(self.reliance())
+        return [*faults, *misfits(self.tree), *sentences(self.inferred_noise()), *on_prior]
+
+    def reliance(self) -> dict[str, Reliance]:
+        """Return what each unknown with a log-normal prior owes to it."""
+        return reliance_of(self.model, self.draws())
 
     def inferred_noise(self) -> list[TakenUp]:
         """Return the inferred noise of each observation, beside its signal and its scatter."""
         return list(taken_up(self.model, self.data, self.draws()))
+
+    def taught_at(self) -> dict[str, np.ndarray]:
+        """Return the draws (s,) by name at which FEM has taught the map; empty for other maps."""
+        taught = json.loads(self.tree.attrs.get(TAUGHT_AT, "{}"))
+        return {name: np.asarray(values) for name, values in taught.items()}
 
     def box_ends(self) -> list[BoxEnd]:
         """Return the ends of ranges that end the posterior in place of the data, worst first."""

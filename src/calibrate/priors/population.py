@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from calibrate.priors.priors import Dependence, JointPrior, log_normal, truncated
+from calibrate.priors.priors import Dependence, JointPrior, Prior, log_normal, truncated
 from emulator.core import schema
 from emulator.core.errors import InputError
 from emulator.scenes.forward_problem import ForwardProblem
@@ -59,21 +59,24 @@ class Population:
         self.dependence  # noqa: B018 - refused here, not where it is used
 
     @property
-    def dependence(self) -> Dependence:
-        """The correlations as a matrix."""
-        names = tuple(self.median)
+    def dependence(self) -> Dependence | None:
+        """The correlations of those that are correlated, as a matrix; None without any."""
+        if not self.correlation:
+            return None
+        correlated = {word.strip() for pair in self.correlation for word in pair.split(",")}
+        names = tuple(name for name in self.median if name in correlated)
         matrix = np.eye(len(names))
         for pair, value in self.correlation.items():
             ends = tuple(word.strip() for word in pair.split(","))
             if len(ends) != 2 or ends[0] == ends[1] or not set(ends) <= set(names):
                 raise InputError(
-                    f"correlation '{pair}': give two of {', '.join(names)}, joined by a comma"
+                    f"correlation '{pair}': give two of {', '.join(self.median)}, joined by a comma"
                 )
             i, j = map(names.index, ends)
             matrix[i, j] = matrix[j, i] = value
         return Dependence(names, matrix)
 
-    def prior(self, scene: ForwardProblem) -> JointPrior:
+    def prior(self, scene: ForwardProblem) -> Prior:
         """Return the population as the prior of ``scene``, cut to its range.
 
         :class:`InputError` for a parameter that the scene does not have, or that lies outside its
@@ -86,7 +89,8 @@ class Population:
                     f"{', '.join(scene.parameter_names)}"
                 )
         priors = {name: log_normal(self.median[name], self.log_sd[name]) for name in self.median}
-        return JointPrior(truncated(priors, scene), self.dependence)
+        cut = truncated(priors, scene)
+        return JointPrior(cut, self.dependence) if self.dependence else cut
 
 
 def population_of_fits(fits: Mapping[str, Sequence[float]], source: str = "") -> Population:
@@ -141,16 +145,22 @@ diagonal, -0.0612, 0.102 and -0.141 beside it, of the factors of a, a_f and b_f 
 POPULATIONS = {"ventricles": VENTRICLES}
 
 
-def prior_of(description: str | Mapping[str, Any], scene: ForwardProblem) -> JointPrior | None:
+def prior_of(description: str | Mapping[str, Any], scene: ForwardProblem) -> Prior | None:
     """Return the prior of a run: that of a population by name or numbers; ``None`` for ``box``.
 
     :class:`InputError` for an unknown name, or a population that does not fit the scene.
     """
+    population = population_called(description)
+    return None if population is None else population.prior(scene)
+
+
+def population_called(description: str | Mapping[str, Any]) -> Population | None:
+    """Return the population of a run's prior, by name or numbers; ``None`` for ``box``."""
     if description == BOX:
         return None
     if not isinstance(description, str):
-        return schema.read_as(Population, description, "prior").prior(scene)
+        return schema.read_as(Population, description, "prior")
     if description not in POPULATIONS:
         known = ", ".join((BOX, *POPULATIONS))
         raise InputError(f"prior '{description}' is unknown; known: {known}, or a file")
-    return POPULATIONS[description].prior(scene)
+    return POPULATIONS[description]

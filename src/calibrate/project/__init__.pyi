@@ -8,12 +8,14 @@ from .problem import (
     simulator_of,
 )
 from .results import holds_population, load, read_posterior
+from .rounds import by_rounds
 from .run import Run
 
 __all__ = [
     "Problem",
     "Run",
     "by_fem",
+    "by_rounds",
     "certify_and_keep",
     "holds_population",
     "infer",

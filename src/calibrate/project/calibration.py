@@ -10,19 +10,27 @@ from typing import Any, cast
 import numpy as np
 
 from calibrate.certificate import Certificate, examine
-from calibrate.certificate.check import can_reweight, reweighted
+from calibrate.certificate.reweighting import can_reweight, reweighted
 from calibrate.measurements import missing_values
 from calibrate.posterior import Posterior, sample
 from calibrate.posterior.diagnosis import MAP_ERRORS, MAP_MOVES, SCALED_NOISE
-from calibrate.project.problem import Problem, build_model, read_problem, simulator_of, with_data
+from calibrate.project.problem import (
+    Problem,
+    build_model,
+    read_problem,
+    simulator_of,
+    with_data,
+)
 from calibrate.project.results import (
     CERTIFICATE,
     SAMPLING,
+    SOLUTIONS,
     remove_pages,
     reserved,
     save_results,
     save_reweighted,
 )
+from calibrate.project.rounds import ROUNDS_RECORD, account_of, by_rounds, taught_map
 from calibrate.project.run import Run
 from calibrate.provenance import as_attributes
 from calibrate.state_names import split
@@ -69,11 +77,13 @@ def infer(
             "population, and calibrate.hierarchy their models"
         )
     target, stages = None if folder is None else Path(folder), Stages(show=progress)
+    checkpoint, solutions = (target and target / name for name in (SAMPLING, SOLUTIONS))
     with nullcontext() if target is None else reserved(target, force=force):
         with stages("scene and data"):
-            problem = with_data(read_problem(run))
+            problem = with_data(by_rounds(read_problem(run)))
         with stages("forward map and model"):
-            model, data = build_model(problem, progress=progress)
+            forward = taught_map(problem, solutions, progress=progress)
+            model, data = build_model(problem, forward, progress=progress)
         sampler, options = problem.run.sampling()
         with stages("sampling"):
             posterior = sample(
@@ -83,7 +93,7 @@ def infer(
                 options=options,
                 seed=problem.run.seed,
                 progress=progress,
-                checkpoint=None if target is None else target / SAMPLING,
+                checkpoint=checkpoint,
             )
         errors = NOT_ASKED
         # The states of a specimen, which has no mesh, are solved, not learned.
@@ -94,11 +104,12 @@ def infer(
                 errors = map_errors(posterior.model, simulator, posterior.draws(), posterior.data)
         attributes = {
             SCALED_NOISE: problem.scaled_noise, MAP_ERRORS: errors.sizes, MAP_MOVES: errors.moves,
-            SECONDS: stages.seconds,
+            SECONDS: stages.seconds, **account_of(model.full),
         }  # fmt: skip
         posterior.tree.attrs.update(as_attributes(attributes))
         if target is not None:
             save_results(target, problem, posterior)
+            target.joinpath(SOLUTIONS).unlink(missing_ok=True)
     return posterior
 
 
@@ -120,7 +131,7 @@ def certify_and_keep(
     folder : the folder of the posterior.
     load_steps : load steps of every solve.
     reweight_to : the folder that the reweighted posterior is written to, ready to be certified in
-        its turn, where the verdict allows it (:func:`calibrate.certificate.check.can_reweight`).
+        its turn, where the verdict allows it.
     progress : whether progress bars, and the seconds of each stage, are shown.
     options : the numbers of FEM runs, and where they are solved, as of
         :func:`calibrate.certificate.examine`, with its errors.
@@ -147,6 +158,8 @@ def report(run: Run, posterior: Posterior, certificate: Certificate | None) -> d
     for name, row in table.items() if run.is_synthetic else ():
         if (value := run.truth.get(name, run.truth.get(split(name)[0]))) is not None:
             row["truth"] = value
+    for name, owed in posterior.reliance().items():
+        table[name] |= owed._asdict()
     result: dict[str, Any] = {
         "scene": run.scene,
         "forward": run.forward,
@@ -161,6 +174,8 @@ def report(run: Run, posterior: Posterior, certificate: Certificate | None) -> d
         "warnings": posterior.warnings(),
         "seconds": json.loads(posterior.tree.attrs.get(SECONDS, "{}")),
     }
+    if ROUNDS_RECORD in posterior.tree.attrs:
+        result[ROUNDS_RECORD] = json.loads(posterior.tree.attrs[ROUNDS_RECORD])
     if "log_evidence" in posterior.tree.attrs:
         result["log_evidence"] = posterior.tree.attrs["log_evidence"]
         result["log_evidence_error"] = posterior.tree.attrs.get("log_evidence_error")

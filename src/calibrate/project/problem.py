@@ -21,6 +21,7 @@ from calibrate.measurements import Observations, parse_observation
 from calibrate.measurements.data import read_measurements
 from calibrate.measurements.usual_noise import size_in, usual_noise
 from calibrate.priors import prior_of
+from calibrate.priors.wide import as_wide
 from calibrate.project.run import Run
 from calibrate.state_names import split
 from calibrate.statistical_model import Model, with_error
@@ -38,6 +39,7 @@ from emulator.scenes.scene import Scene
 from emulator.surrogates import registry
 from emulator.surrogates.fem import by_solver
 from emulator.surrogates.protocol import ForwardMap, Ingredients
+from emulator.surrogates.taught import ROUNDS
 
 
 @kept
@@ -122,6 +124,9 @@ def read_problem(
         if scene is None:
             scene = find_problem(run.scene, run.root)
             table = scene.table
+        if run.forward == ROUNDS.name:
+            wide, scene = as_wide(run.prior, scene, run.bounded)
+            run = replace(run, prior=wide)
         if run.is_synthetic:
             names = {**run.known, **run.truth}
             states = tuple(dict.fromkeys(state for _, state in map(split, names) if state))
@@ -224,12 +229,18 @@ def model_before_data(run: Run | Problem, *, progress: bool = False) -> Model:
     return with_described_errors(run_model, means, run.systematic)[0]
 
 
-def build_model(problem: Problem, *, progress: bool = False) -> tuple[Model, Mapping[str, Any]]:
-    """Return the statistical model of a problem with data, and the data that it is sampled with."""
+def build_model(
+    problem: Problem, forward: ForwardMap | None = None, *, progress: bool = False
+) -> tuple[Model, Mapping[str, Any]]:
+    """Return the statistical model of a problem with data, and the data that it is sampled with.
+
+    forward : a forward map over all nodes; by default the one that the run names.
+    """
     run = problem.run
     assert problem.data is not None, "with_data comes first"
     data: Mapping[str, Any] = problem.data
-    run_model = model_of(run, build_forward(problem, progress=progress), problem.observe)
+    forward = build_forward(problem, progress=progress) if forward is None else forward
+    run_model = model_of(run, forward, problem.observe)
     if run.systematic:
         run_model, data = with_described_errors(run_model, data, run.systematic)
     if runs := run.error_runs or run.mesh_error_runs:

@@ -187,9 +187,9 @@ def with_error(
                 return None
             known.extend(pair.estimates)
             return pair.fine
-        if (fields := next(fem.equilibria([draw]))[1]) is None:
+        if (solved := next(fem.equilibria([draw]))[1]) is None:
             return None
-        seen = jnp.stack([u[model.observe.nodes] for u in fields])
+        seen = jnp.stack([field.displacement[model.observe.nodes] for field in solved])
         return np.asarray(ravel_pytree(model.observe(seen, model.states.thetas(draw)))[0])
 
     draws = model.prior_draws(jax.random.key(seed), runs)

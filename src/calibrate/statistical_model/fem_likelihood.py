@@ -6,7 +6,7 @@ draw.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple, cast
 
@@ -16,9 +16,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from calibrate.statistical_model.model import Data, Model
-from emulator.core.errors import InputError, SolverError
+from emulator.core.errors import InputError
 from emulator.fem import Simulator
-from emulator.fem.campaign import Solver, solve_rows
+from emulator.fem.campaign import Field, Neighbours, Solver, solve_rows
 from emulator.fem.energy import volume_ratio
 from emulator.fem.solution import EquilibriumSolver
 from emulator.scenes.scene import Scene
@@ -50,19 +50,29 @@ class Likelihoods(NamedTuple):
 
 
 class FEMLikelihood:
-    """FEM's log likelihood under ``model``; solves start from the cheap map's prediction.
+    """FEM's log likelihood under ``model``.
+
+    Solves start from the cheap map's prediction, or from the nearest solution that was kept.
 
     model : the statistical model.
     simulator : the simulator of the model's scene, or of its specimen.
+    kept : the solutions at which nothing is solved again, with their sensitivities, by the bytes of
+        their theta; those of every solve are added. None to keep none.
 
     :class:`InputError` where the simulator is for another scene.
     """
 
-    def __init__(self, model: Model, simulator: EquilibriumSolver) -> None:
+    def __init__(
+        self,
+        model: Model,
+        simulator: EquilibriumSolver,
+        *,
+        kept: dict[bytes, Field] | None = None,
+    ) -> None:
         if simulator.scene.fingerprint != model.forward.scene.fingerprint:
             raise InputError("the simulator's scene is not the posterior's")
         self.model, self.simulator = model, simulator
-        self._solver = Solver(simulator, from_rest_again=False)
+        self.kept = kept
         self._start, self._cheap = jax.jit(model.full), jax.jit(model.map_log_likelihood)
         self._fem, self._derivatives = jax.jit(self._by_fem), jax.jit(self._slopes_of_means)
 
@@ -88,49 +98,80 @@ class FEMLikelihood:
         stability : numbers of the draws for which ``stable`` is asked, too.
         slopes : whether ``slopes`` are asked for every draw, at a tenth of the time of a solve.
         """
-        for number, fields in self.equilibria(draws):
+        for number, solved in self.equilibria(draws, slopes=slopes):
             draw, thetas = draws[number], self.model.states.thetas(draws[number])
             cheap = float(self._cheap(dict(draw), data))
-            if fields is None:
+            if solved is None:
                 yield number, Likelihoods(-np.inf, cheap, converged=False, smallest_J=np.nan)
                 continue
+            fields = [field.displacement for field in solved]
             fem, means, smallest_J = self._fem(jnp.stack(fields), thetas, dict(draw), data)
             stable = self._stable(fields, thetas) if number in stability else None
-            derivatives = self._slopes(fields, thetas) if slopes else None
+            derivatives = self._slopes(solved, thetas) if slopes else None
             values = (float(fem), cheap, True, float(smallest_J), means, stable, derivatives)
             yield number, Likelihoods(*values)
 
     def equilibria(
-        self, draws: Sequence[Mapping[str, Any]]
-    ) -> Iterator[tuple[int, list[jax.Array] | None]]:
-        """Yield numbers of ``draws`` and their equilibria, as they are finished.
+        self, draws: Sequence[Mapping[str, Any]], *, slopes: bool = False
+    ) -> Iterator[tuple[int, list[Field] | None]]:
+        """Yield numbers of ``draws`` and their solutions, as they are finished.
 
-        An equilibrium is FEM's displacement (n, 3) mm in each load state; ``None`` stands for a
-        draw at which FEM did not converge in one of the states.
+        They are FEM's in each load state; ``None`` stands for a draw at which FEM did not converge
+        in one of the states.
+
+        slopes : whether the solutions have their sensitivities.
         """
         thetas = jnp.concatenate([self.model.states.thetas(draw) for draw in draws])
-        states = len(self.model.states.states)
-        solutions: dict[int, dict[int, jax.Array]] = {number: {} for number in range(len(draws))}
+        states, kept = len(self.model.states.states), {} if self.kept is None else self.kept
+        keys = [theta.tobytes() for theta in np.asarray(thetas)]
+        solutions = {
+            draw: {
+                s: kept[key] for s, key in enumerate(keys[draw * states :][:states]) if key in kept
+            }
+            for draw in range(len(draws))
+        }
+        for draw in [draw for draw, fields in solutions.items() if len(fields) == states]:
+            fields = solutions.pop(draw)
+            yield draw, [fields[k] for k in range(states)]
         # A draw that fails in one load state is done: its other states are not begun.
-        numbers = (k for k in range(len(thetas)) if k // states in solutions)
+        numbers = (
+            k
+            for k in range(len(thetas))
+            if k // states in solutions and k % states not in solutions[k // states]
+        )
+        solver = Solver(self.simulator, sensitivities=slopes, from_rest_again=bool(kept))
+        nearest = self._kept_beside(thetas)
         # Not under jit: there the solver cannot use CHOLMOD, which is faster.
         for row in solve_rows(
-            self._solver,
+            solver,
             thetas,
             numbers=numbers,
-            starts=lambda k: (self._start(thetas[k]),),
+            starts=lambda k: (*nearest(k), self._start(thetas[k])),
         ):
             number, state = divmod(row.number, states)
+            field = Field(row.solution.displacement, row.sensitivities)
+            if self.kept is not None and row.converged:
+                self.kept[keys[row.number]] = field
             if number not in solutions:
                 continue
             if not row.converged:
                 del solutions[number]
                 yield number, None
                 continue
-            solutions[number][state] = row.solution.displacement
+            solutions[number][state] = field
             if len(solutions[number]) == states:
                 fields = solutions.pop(number)
-                yield number, [jnp.asarray(fields[k]) for k in range(states)]
+                yield number, [fields[k] for k in range(states)]
+
+    def _kept_beside(self, thetas: jax.Array) -> Callable[[int], list[jax.Array]]:
+        """Return the starts from kept solutions of each of ``thetas`` (c, p), by its number."""
+        if not self.kept:
+            return lambda _: []
+        count = len(thetas)
+        known = np.array([np.frombuffer(key) for key in self.kept])
+        fields = {count + k: field for k, field in enumerate(self.kept.values())}
+        every = jnp.concatenate([thetas, known])
+        return Neighbours(cast(Scene, self.simulator.scene), every, fields)
 
     def _stable(self, fields: list[jax.Array], thetas: jax.Array) -> bool | None:
         """Return whether every state's equilibrium is a minimum of the energy, if there is one."""
@@ -147,17 +188,13 @@ class FEMLikelihood:
             self.simulator.is_stable(u, theta) for u, theta in zip(fields, thetas, strict=True)
         )
 
-    def _slopes(self, fields: list[jax.Array], thetas: jax.Array) -> np.ndarray | None:
+    def _slopes(self, solved: list[Field], thetas: jax.Array) -> np.ndarray | None:
         """Return derivatives (m, S, p) of the flat means, by those of the equilibria."""
         nodes = self.model.observe.nodes
-        try:
-            du = [
-                self.simulator.sensitivities(u, theta)[:, nodes]
-                for u, theta in zip(fields, thetas, strict=True)
-            ]
-        except SolverError:
-            return None
-        return np.asarray(self._derivatives(jnp.stack(fields)[:, nodes], jnp.stack(du), thetas))
+        u = jnp.stack([jnp.asarray(field.displacement)[nodes] for field in solved])
+        du = jnp.stack([jnp.asarray(field.sensitivities)[:, nodes] for field in solved])
+        slopes = np.asarray(self._derivatives(u, du, thetas))
+        return slopes if np.isfinite(slopes).all() else None
 
     def _slopes_of_means(self, u: jax.Array, slopes: jax.Array, thetas: jax.Array) -> jax.Array:
         """Return derivatives (m, S, p), from u (S, k, 3) and du/dtheta (S, p, k, 3) there."""

@@ -24,7 +24,8 @@ from calibrate.importance.proposals import (
     resampled,
 )
 from calibrate.importance.weights import normalised
-from calibrate.statistical_model.predictive import Correction, Densities, Predictive
+from calibrate.statistical_model.correction import Correction
+from calibrate.statistical_model.predictive import Densities, Predictive
 
 _ENOUGH = 800.0  # effective points at which the pool is good
 _FOLLOWING = 2048  # points of the proposal that follows the draws
@@ -53,12 +54,13 @@ class Pool(WeightedPoints):
         cls,
         predictive: Predictive,
         correction: Correction,
-        draws: np.ndarray,
+        draws: np.ndarray | None,
         modes: tuple[np.ndarray, ...],
         rng: np.random.Generator,
     ) -> Pool:
         """Return weighted points that cover draws z (s, p) and the modes found from prior draws.
 
+        draws : draws of a posterior; None where there are none yet.
         modes : points around each further mode of FEM.
         """
         z = predictive.prior_draws(key_from(rng), _PRIOR)
@@ -72,8 +74,9 @@ class Pool(WeightedPoints):
                 break
             pool = pool.stepped(pool.log_explored, rng)
         pool = replace(pool, follower=len(pool.proposals))
-        pool = pool.extended(Kernels.following(draws, rng), _FOLLOWING, rng)
-        pool = pool.extended(Kernels.surrounding(draws, rng), _WIDE, rng)
+        if draws is not None:
+            pool = pool.extended(Kernels.following(draws, rng), _FOLLOWING, rng)
+            pool = pool.extended(Kernels.surrounding(draws, rng), _WIDE, rng)
         for points in modes:
             pool = pool.extended(Kernels.following(points, rng), STEP, rng)
         return pool.polished(rng)

@@ -5,27 +5,8 @@ A certificate asks for the posterior where no draw is. In unconstrained coordina
 
 .. math:: \log p(z) + \log p(y \mid g(\theta(z)) + d(\theta(z)))
 
-with the prior and its Jacobian, the map's data without noise :math:`g`, and a correction :math:`d`,
-which is zero for the map alone.
-
-The correction is a Gaussian process of theta in the space of the data. At some theta FEM was
-solved, and the map misses the data's means by :math:`D`. Between them
-
-.. math:: d(x) = k(x, X) (k(X, X) + \tau^2 I)^{-1} D, \quad
-    k(x, x') = v (1 + x \cdot x') + \exp(-|x - x'|^2 / 2 \ell^2)
-
-for all data at once, with theta standardised, :math:`x`, and a linear trend of wide prior
-:math:`v`. :math:`\ell` and :math:`\tau` minimise leave-one-out errors, which for a Gaussian
-process have a closed form (Rasmussen and Williams 2006, Eq. 5.10-5.12). The size of these errors
-also sets the scale :math:`a^2` of the process's variance, in squared noise sd,
-
-.. math:: v(x) = a^2 (k(x, x) + \tau^2 - k(x, X) (k(X, X) + \tau^2 I)^{-1} k(X, x))
-
-A wrong correction costs precision, not correctness: :math:`v` only says where to solve FEM next,
-and FEM at fresh points tests what the correction predicts (:mod:`calibrate.certificate.check`). A
-bump far from the posterior may spoil a process everywhere. So there are three candidates, a process
-of all points, one of those that FEM finds likely, and none; leave-one-out errors at the likely ones
-decide.
+with the prior and its Jacobian, the map's data without noise :math:`g`, and a correction :math:`d`
+(:mod:`calibrate.statistical_model.correction`), which is zero for the map alone.
 """
 
 from __future__ import annotations
@@ -33,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from itertools import product
 from typing import Any, NamedTuple
 
 import jax
@@ -42,6 +22,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from scipy.linalg import eigh
 
+from calibrate.statistical_model.correction import Correction, correct, corrections
 from calibrate.statistical_model.density import (
     BATCH,
     Density,
@@ -52,12 +33,7 @@ from calibrate.statistical_model.density import (
     without_nan,
 )
 from calibrate.statistical_model.model import Data, Model
-from emulator.core.gaussian_process import Regression, squared_exponential
 
-_LENGTHS = (0.25, 0.5, 1.0, 2.0, 4.0)  # correlation lengths that are compared, in sd of the points
-_NUGGETS = (1e-6, 1e-4, 1e-2, 1.0, 1e2)
-_TREND = 1e2
-_NEGLIGIBLE = 1e-3  # leave-one-out error, in noise sd, that changes no posterior
 _WIDTH_DRAWS = 512  # draws of the prior, from which the scale of theta's features is taken
 
 
@@ -71,131 +47,6 @@ def noise_sds(model: Model, draws: Mapping[str, np.ndarray]) -> dict[str, float]
         name: float(noise.size({s: jnp.median(draws[site]) for s, site in sites[name].items()}))
         for name, noise in model.noise.items()
     }
-
-
-class Correction(NamedTuple):
-    r"""A fitted Gaussian process; all zeros for no correction.
-
-    at : the features (n, q) of theta where FEM was solved, standardised; rows of zeros may be
-        padding.
-    weights : the weights of the kernel (n, m), zero in rows of padding.
-    inverse : the inverse of the kernel matrix (n, n).
-    centre, width : the mean and sd (q,) of the features, by which they are standardised.
-    length, nugget, scale : :math:`\\ell`, :math:`\\tau^2` and :math:`a^2` of the kernel.
-    local : whether it was fitted to likely points alone.
-    """
-
-    at: np.ndarray
-    weights: np.ndarray
-    inverse: np.ndarray
-    centre: np.ndarray
-    width: np.ndarray
-    length: float
-    nugget: float
-    scale: float
-    local: bool
-
-
-def no_correction(rows: int, features: int, data: int) -> Correction:
-    """Return the correction that is zero, of the shape of one fitted to ``rows`` points."""
-    at, weights, inverse = (np.zeros((rows, width)) for width in (features, data, rows))
-    centre, width = np.zeros(features), np.ones(features)
-    return Correction(at, weights, inverse, centre, width, 1.0, 0.0, 0.0, local=False)
-
-
-def _covariance(products: Any, squared: Any) -> Any:
-    """Return k(x, x') from products of standardised features and squared distances in lengths."""
-    return _TREND * (1.0 + products) + squared_exponential(squared)
-
-
-def correct(correction: Correction, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the correction (m,) at features ``x`` (q,), and its variance in squared noise sd."""
-    c = correction
-    x = (x - c.centre) / c.width
-    distance = jnp.sum((c.at - x) ** 2, axis=-1)
-    kernel = _covariance(c.at @ x, distance / c.length**2)
-    prior_variance = _TREND * (1.0 + x @ x) + 1.0 + c.nugget
-    variance = c.scale * jnp.maximum(prior_variance - kernel @ c.inverse @ kernel, c.nugget)
-    return kernel @ c.weights, variance
-
-
-@jax.jit
-def corrections(correction: Correction, x: jax.Array) -> jax.Array:
-    """Return the correction (s, m) at features ``x`` (s, q)."""
-    return jax.vmap(lambda row: correct(correction, row)[0])(x)
-
-
-def fit_correction(
-    x: np.ndarray,
-    errors: np.ndarray,
-    scales: np.ndarray,
-    rows: int,
-    likely: np.ndarray | None = None,
-    like: Correction | None = None,
-) -> Correction:
-    """Return the best of a Gaussian process of all points, one of likely points, and none.
-
-    Parameters
-    ----------
-    x : the features (n, q) at which FEM was solved.
-    errors : FEM's data less the map's there, (n, m).
-    scales : the noise sd (m,) of each datum, the unit of leave-one-out errors.
-    rows : the number of points to which the result is padded with zeros, so that programs are
-        compiled once.
-    likely : (n,) bool, points that FEM finds likely, which decide what is best; all by default.
-    like : the correction whose points and kernel are taken; by default they are searched for.
-    """
-    every = np.ones(len(x), dtype=bool)
-    likely = every if likely is None or not likely.any() else likely
-    parts, kernels = [every], list(product(_LENGTHS, _NUGGETS))
-    # Precise data: the map misses far away by so much that errors near the posterior are hidden.
-    if x.shape[1] + 2 <= likely.sum() < len(x):
-        parts.append(likely)
-    if like is not None and like.nugget > 0.0:
-        parts, kernels = parts[-1:] if like.local else parts[:1], [(like.length, like.nugget)]
-    squared_errors = np.mean((errors / scales) ** 2, axis=1)
-    best = no_correction(rows, x.shape[1], errors.shape[1])._replace(
-        scale=float(np.mean(squared_errors / (_TREND * (x**2).sum(axis=1) + _TREND + 1.0)))
-    )
-    smallest = np.log(squared_errors[likely] + _NEGLIGIBLE**2).mean()
-    for used in parts:
-        fitted, loss = _fitted(x[used], errors[used], scales, rows, likely[used], kernels)
-        if loss < smallest:
-            best, smallest = fitted._replace(local=used is not every), loss
-    return best
-
-
-def _fitted(
-    x: np.ndarray,
-    errors: np.ndarray,
-    scales: np.ndarray,
-    rows: int,
-    likely: np.ndarray,
-    kernels: list[tuple[float, float]],
-) -> tuple[Correction, float]:
-    """Return the process of these points, and the mean log of its errors where it is ``likely``."""
-    width = x.std(axis=0)
-    centre, width = x.mean(axis=0), np.where(width > 0.0, width, 1.0)
-    x = (x - centre) / width
-    fitted = no_correction(rows, x.shape[1], errors.shape[1])._replace(centre=centre, width=width)
-    fitted.at[: len(x)] = x
-    smallest, where_likely = np.inf, np.inf
-    distances = ((x[:, None] - x) ** 2).sum(axis=-1)
-    for length, nugget in kernels:
-        kernel = _covariance(x @ x.T, distances / length**2) + nugget * np.eye(len(x))
-        regression = Regression.of(kernel)
-        inverse, weights = regression.inverse(), regression.weights(errors)
-        # Leave-one-out errors in noise sd, and their variances up to a^2.
-        variance = 1.0 / np.diag(inverse)
-        square = np.mean((weights * variance[:, None] / scales) ** 2, axis=1)
-        # Geometric mean over the points, so that the prior's corners do not decide.
-        losses = np.log(square + _NEGLIGIBLE**2)
-        if losses.mean() < smallest:
-            smallest, where_likely = losses.mean(), losses[likely].mean()
-            fitted.weights[: len(x)], fitted.inverse[: len(x), : len(x)] = weights, inverse
-            scale = float(np.mean(square / variance))
-            fitted = fitted._replace(length=length, nugget=nugget, scale=scale)
-    return fitted, where_likely
 
 
 def gauss_newton_step(
@@ -328,6 +179,29 @@ class Predictive:
             return ravel_pytree(self.model.means(thetas)[0])[0]
 
         return jax.jacfwd(means)(self.model.states.thetas(self._constrain(z)))
+
+    def error_slopes(self, z: np.ndarray, of_fem: np.ndarray) -> np.ndarray:
+        """Return the derivatives (q, m) in the features, at z (p,), of FEM's data less the map's.
+
+        of_fem : derivatives (m, S, p) of FEM's data in the theta of each load state.
+        """
+        of_map, of_thetas = self._feature_slopes(z)
+        return np.tensordot(of_thetas, of_fem, axes=([0, 1], [1, 2])) - of_map
+
+    @_compiled
+    def _feature_slopes(self, z: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return the derivatives in the features: of the map's data (q, m), of theta (S, p, q)."""
+        centre, width = self._scale_of_features
+
+        def thetas(x: jax.Array) -> jax.Array:
+            values = self.model.from_scales(centre + width * x)
+            return self.model.states.thetas(
+                dict(zip(self.model.states.unknowns, values, strict=True))
+            )
+
+        x = self._features(self._constrain(z))
+        of_data = jax.jacfwd(lambda x: ravel_pytree(self.model.means(thetas(x))[0])[0])(x)
+        return of_data.T, jax.jacfwd(thetas)(x)
 
     @cached_property
     def prior_sd(self) -> np.ndarray:

@@ -18,6 +18,7 @@ from emulator.surrogates.emulator import EMULATOR
 from emulator.surrogates.fem import FEM
 from emulator.surrogates.pod_gp import REDUCED
 from emulator.surrogates.protocol import ForwardKind, ForwardMap, Ingredients, Option
+from emulator.surrogates.taught import ROUNDS
 
 FORWARD_MAPS: dict[str, ForwardKind] = {
     kind.name: kind
@@ -25,6 +26,7 @@ FORWARD_MAPS: dict[str, ForwardKind] = {
         EMULATOR,
         CORRECTED,
         REDUCED,
+        ROUNDS,
         FEM,
         *offered("emulator.specimens.homogeneous", "HOMOGENEOUS"),
         *offered("emulator.specimens.homogeneous", "INCOMPRESSIBLE"),

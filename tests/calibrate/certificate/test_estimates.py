@@ -10,8 +10,9 @@ from calibrate.certificate import estimates
 from calibrate.certificate.estimates import jackknife, misfits, missed_by, moments
 from calibrate.certificate.runs import FEMRuns
 from calibrate.posterior.diagnosis import Misfit
+from calibrate.statistical_model.correction import no_correction
 from calibrate.statistical_model.pool import Pool
-from calibrate.statistical_model.predictive import Predictive, no_correction
+from calibrate.statistical_model.predictive import Predictive
 from certificate_support import (
     NODES,
     exact_data,

@@ -5,12 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calibrate.statistical_model.predictive import (
-    correct,
-    fit_correction,
-    gauss_newton_step,
-    no_correction,
-)
+from calibrate.statistical_model.correction import correct, fit_correction, no_correction
+from calibrate.statistical_model.predictive import gauss_newton_step
 
 
 def points(count, seed=0):

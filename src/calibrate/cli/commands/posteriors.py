@@ -31,7 +31,15 @@ if TYPE_CHECKING:
 def infer(arguments: Namespace) -> Answer:
     """Sample and certify a posterior, or those of members of a population, and save them."""
     from calibrate.cli.run_words import plan_of
-    from calibrate.project import Problem, Run, certify_and_keep, infer, read_problem, report
+    from calibrate.project import (
+        Problem,
+        Run,
+        by_rounds,
+        certify_and_keep,
+        infer,
+        read_problem,
+        report,
+    )
 
     folder, progress = check_folder(arguments.out), not arguments.json
     plan, force, certify = plan_of(arguments), arguments.force, not arguments.no_certify
@@ -45,7 +53,7 @@ def infer(arguments: Namespace) -> Answer:
         result = members_report(hierarchy, verdicts)
         usable = {*verdicts.values()} <= {"accepted"}
         return Answer(result, f"{members_summary(result)}\n{written}", usable)
-    problem = read_problem(plan)
+    problem = by_rounds(read_problem(plan))
     run, (sampler, options) = problem.run, problem.run.sampling()
     if arguments.warmup is not None and not hasattr(options, "warmup"):
         raise InputError(

@@ -1,0 +1,66 @@
+"""Wide priors, from the ranges that somebody thought possible, and scenes as wide as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+
+from calibrate.priors.population import BOX, Population, population_called
+from emulator.scenes.forward_problem import ForwardProblem
+from emulator.scenes.scene import Scene, with_mesh
+
+_LEAST_LOG_SD = float(np.log(2.0))
+_WIDTH = 3.72  # sd to each side of a median that hold all but 2e-4 of the mass
+
+
+def wide_prior(scene: ForwardProblem, bounded: Collection[str] = ()) -> Population | None:
+    """Return log-normals of the parameters above zero; None where there is none.
+
+    A range that somebody thought possible is one sd of the logarithm to each side of its middle,
+    and a factor of 2 at least. A parameter whose range is ``bounded`` by nature keeps it.
+    """
+    median, log_sd = dict[str, float](), dict[str, float]()
+    for k, parameter in enumerate(scene.parameters):
+        if parameter.low > 0.0 and parameter.name not in bounded:
+            median[parameter.name] = float(scene.centre[k])
+            half = 0.5 * float(np.log(parameter.high / parameter.low))
+            log_sd[parameter.name] = max(half, _LEAST_LOG_SD)
+    if not median:
+        return None
+    source = "the scene's ranges, one sd of the logarithm to each side"
+    return Population(median, log_sd, source=source)
+
+
+def as_wide(
+    prior: str | Mapping[str, Any], scene: ForwardProblem, bounded: Collection[str]
+) -> tuple[str | dict[str, Any], ForwardProblem]:
+    """Return a run's prior in numbers, wide where it states none, and the scene as wide as it.
+
+    Parameters
+    ----------
+    prior : the run's words or numbers. bounded : the parameters whose range nature ends.
+    """
+    population = completed(population_called(prior), wide_prior(scene, bounded))
+    if population is None:
+        return BOX, scene
+    return asdict(population), widened(with_mesh(scene), population)
+
+
+def completed(stated: Population | None, wide: Population | None) -> Population | None:
+    """Return the population of ``stated`` parameters, and of all others that ``wide`` has."""
+    if stated is None or wide is None:
+        return stated or wide
+    return replace(stated, median=wide.median | stated.median, log_sd=wide.log_sd | stated.log_sd)
+
+
+def widened(scene: Scene, prior: Population) -> Scene:
+    """Return ``scene`` with ranges that hold all but 2e-4 of a prior's mass of each parameter."""
+    parameters = list(scene.parameters)
+    for k, parameter in enumerate(parameters):
+        if (median := prior.median.get(parameter.name)) is not None:
+            step = float(np.exp(_WIDTH * prior.log_sd[parameter.name]))
+            parameters[k] = replace(parameter, low=median / step, high=median * step, scale="log")
+    return replace(scene, parameters=tuple(parameters))

@@ -1,0 +1,274 @@
+r"""Rounds of FEM runs that find where a posterior is, and teach an emulator there.
+
+Nobody knows beforehand where the data will put a posterior. So the prior is wide, a log-normal of
+each parameter, and FEM is asked where it says most:
+
+1. **Begin.** A few runs, with derivatives, are spread over the prior.
+2. **Repeat.** A Gaussian process of the data's means and their derivatives is fitted to all runs
+   (:mod:`calibrate.statistical_model.correction`), weighted points follow its posterior
+   (:mod:`calibrate.statistical_model.pool`), and fresh runs are made at some of them: half are
+   draws of that posterior, which test the process before they teach it, half are far from all runs,
+   where it doubts.
+3. **End.** The rounds end when the process foresees FEM at the draws of a round: their log
+   likelihoods differ by less than 0.1 nats in root mean square, twice, or no more runs are
+   allowed. A posterior whose log density is wrong by the sd :math:`s` has means wrong by :math:`s`
+   sd at most, since :math:`|\mathrm{cov}(x, w)| \le \mathrm{sd}(x)\, \mathrm{sd}(w)`.
+4. **Teach.** The displacements of all runs, with their sensitivities, become an emulator of the
+   whole body (:mod:`emulator.surrogates.discrepancy`).
+
+What the emulator is worth is judged by the certificate, by FEM runs of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibrate.certificate.runs import FEMRunner, FEMRuns, correction_from, least_likely
+from calibrate.importance.proposals import key_from
+from calibrate.importance.weights import normalised
+from calibrate.posterior.diagnosis import TAUGHT_AT
+from calibrate.project.problem import Problem, build_model, read_problem
+from calibrate.statistical_model import FEMLikelihood, Model
+from calibrate.statistical_model.pool import Pool
+from calibrate.statistical_model.predictive import Predictive
+from emulator.core.display import counting
+from emulator.core.errors import SolverError
+from emulator.core.machine import one_blas_thread
+from emulator.core.store import read_arrays, save_arrays
+from emulator.fem import Simulator
+from emulator.fem.campaign import Field, Runs
+from emulator.scenes.scene import Scene, with_mesh
+from emulator.surrogates import registry, shipped
+from emulator.surrogates.discrepancy import maximin_subset
+from emulator.surrogates.emulator import EMULATOR, Emulator
+from emulator.surrogates.protocol import ForwardMap
+from emulator.surrogates.taught import ROUNDS, TaughtEmulator, taught
+from emulator.training.mechanics import add_discrepancy
+
+ROUNDS_RECORD = "rounds"
+"""The entry of an emulator's record, and the attribute of a posterior, that lists the rounds."""
+_ARRAYS = ("theta", "displacement", "sensitivities")  # of a file of solutions
+_A_ROUND = 8  # runs of a round; half of them are draws
+_BEGIN = 10  # runs spread over the prior
+_CANDIDATES = 16  # points of which one is taken, where the farthest are
+_FORESEEN = 0.1  # nats by which a log likelihood may be missed
+_LIKELY = 0.99  # mass of the Gaussian at the best run in which draws count
+_NOISE_DRAWS = 256  # draws of the prior of a noise sd that is inferred
+
+
+@dataclass(frozen=True)
+class Round:
+    """What one round found.
+
+    runs : the number of runs so far. failed : those at which FEM failed.
+    missed : the root mean square by which log likelihoods at the round's draws were missed, nats;
+        infinite where no draw was likely.
+    """
+
+    runs: int
+    failed: int
+    missed: float
+
+
+def teach(
+    model: Model,
+    data: Mapping[str, Any],
+    simulator: Simulator,
+    *,
+    most: int,
+    seed: int = 0,
+    keep: Path | None = None,
+    progress: bool = False,
+) -> TaughtEmulator:
+    """Return an emulator of FEM runs where the posterior is; its record lists the rounds.
+
+    Parameters
+    ----------
+    model : the model of the data, of the body at rest in place of a forward map.
+    most : the largest number of runs, each in every load state.
+    keep : the file of FEM's solutions, from which a killed search goes on: the same points are
+        asked, and those it holds are not solved again. None for none.
+
+    Raises
+    ------
+    SolverError
+        FEM fails at most points of the prior.
+    """
+    rng = np.random.default_rng([seed, 2])
+    kept = {} if keep is None else _read(keep, simulator.scene.fingerprint)
+    likelihood = FEMLikelihood(model, simulator, kept=kept)
+    rounds = list[Round]()
+    with (
+        one_blas_thread(),
+        counting(
+            total=most, desc="FEM where the posterior is", disable=not progress, unit="run"
+        ) as bar,
+    ):
+        predictive = Predictive(model, data, _noise_draws(model))
+        solver = FEMRunner(predictive, likelihood, bar)
+
+        def ask(z: np.ndarray) -> FEMRuns:
+            answers = solver(z, slopes=True)
+            if keep is not None:
+                _write(keep, kept, simulator.scene.fingerprint)
+            return answers
+
+        runs = ask(_spread_over_prior(predictive, min(_BEGIN, most), rng))
+        _require_half(runs)
+        while len(runs.z) < most and not _are_foreseen(rounds):
+            fresh, predicted, drawn = _fresh_points(predictive, runs, most, rng)
+            answers = ask(fresh[: most - len(runs.z)])
+            rounds.append(_judged(runs, answers, predicted, drawn))
+            runs = FEMRuns.joined([runs, answers])
+            bar.set_postfix_str(f"log likelihoods missed by {rounds[-1].missed:.2g}")
+        bar.close()
+    emulator, record = add_discrepancy(Emulator(simulator.scene), _runs_of(kept))
+    at = predictive.constrain(runs.z[runs.converged])
+    taught_at = {name: values.tolist() for name, values in at.items()}
+    rounds_record = {ROUNDS_RECORD: [asdict(r) for r in rounds], TAUGHT_AT: taught_at}
+    record = {"discrepancy": record, **rounds_record}
+    return taught(replace(emulator, record=record))
+
+
+def by_rounds(problem: Problem) -> Problem:
+    """Return the problem with a map that is taught where its scene has no emulator.
+
+    A run that names a forward map or an emulator is returned as it is.
+    """
+    run, scene = problem.run, problem.scene
+    named = run.forward != EMULATOR.name or run.emulator is not None
+    if named or not isinstance(scene, Scene) or scene.name in shipped():
+        return problem
+    return read_problem(replace(run, forward=ROUNDS.name), scene=scene)
+
+
+def taught_map(
+    problem: Problem, keep: Path | None = None, *, progress: bool = False
+) -> TaughtEmulator | None:
+    """Return the map that rounds of FEM runs teach; None where the run names another one.
+
+    keep : the file of FEM's solutions, as of :func:`teach`.
+    """
+    run = problem.run
+    if run.forward != ROUNDS.name:
+        return None
+    at_rest = Emulator(with_mesh(problem.scene)).cache()
+    bare = replace(problem, run=replace(run, error_runs=0, mesh_error_runs=0))
+    model, data = build_model(bare, at_rest)
+    model, data = replace(model, check_scale=False).given(data)
+    most = registry.full_options(ROUNDS.name, run.forward_options)["most_runs"]
+    simulator = cast(Simulator, problem.simulator)
+    return teach(model, data, simulator, most=most, seed=run.seed, keep=keep, progress=progress)
+
+
+def account_of(forward: ForwardMap) -> dict[str, Any]:
+    """Return the rounds, and the draws at which FEM was solved, of a map that they taught."""
+    if not isinstance(forward, TaughtEmulator):
+        return {}
+    return {name: forward.emulator.record[name] for name in (ROUNDS_RECORD, TAUGHT_AT)}
+
+
+def _require_half(runs: FEMRuns) -> None:
+    """Raise :class:`SolverError` where FEM fails at most of the prior."""
+    failed = int((~runs.converged).sum())
+    if failed > 0.5 * len(runs.z):
+        raise SolverError(
+            f"FEM fails at {failed} of {len(runs.z)} points of the prior; narrow it, or raise "
+            "--load-steps"
+        )
+
+
+def _are_foreseen(rounds: list[Round]) -> bool:
+    """Return whether FEM was foreseen in the last two rounds."""
+    return len(rounds) > 1 and all(r.missed <= _FORESEEN for r in rounds[-2:])
+
+
+def _noise_draws(model: Model) -> dict[str, np.ndarray]:
+    """Return draws of the prior of everything that is inferred, for the size of unknown noise."""
+    keys = jax.random.split(jax.random.key(0), len(model.sampled_priors))
+    priors = zip(model.sampled_priors.items(), keys, strict=True)
+    return {name: np.asarray(p.sample(key, (_NOISE_DRAWS,))) for (name, p), key in priors}
+
+
+def _spread_over_prior(predictive: Predictive, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Return points z (count, p) far from each other in the prior's bulk, from its middle on."""
+    z = predictive.prior_draws(key_from(rng), _CANDIDATES * count)
+    distance = (((z - np.median(z, axis=0)) / z.std(axis=0)) ** 2).sum(axis=1)
+    bulk = z[np.argsort(distance)[: len(z) * 3 // 4]]
+    return bulk[maximin_subset(bulk / z.std(axis=0), count)]
+
+
+def _fresh_points(
+    predictive: Predictive, runs: FEMRuns, most: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Return points z (k, p) to ask FEM at, their predicted log likelihoods, and the draws' number.
+
+    The first points are draws of the posterior as the runs so far have it. The others are those of
+    many, where FEM may find the data likely, that are farthest from all runs.
+    """
+    correction = correction_from(runs, predictive, most)
+    pool = Pool.search(predictive, correction, None, (), rng)
+    drawn = _A_ROUND // 2
+    rows = pool.resampled(drawn, rng)
+    chances = 0.5 * (normalised(pool.log_explored) + pool.corrected)
+    others = rng.choice(len(pool.z), size=_CANDIDATES * (_A_ROUND - drawn), p=chances)
+    scale = np.sqrt(np.cov(pool.z[others], rowvar=False).reshape(len(pool.z[0]), -1).diagonal())
+    known = np.concatenate([runs.z, pool.z[rows]])
+    x = np.concatenate([known, pool.z[others]]) / np.maximum(scale, 1e-12)
+    distance = np.min(((x[len(known) :, None] - x[: len(known)]) ** 2).sum(axis=-1), axis=1)
+    taken = list[int]()
+    for _ in range(_A_ROUND - drawn):
+        taken.append(int(np.argmax(distance)))
+        step = ((x[len(known) :] - x[len(known) + taken[-1]]) ** 2).sum(axis=-1)
+        distance = np.minimum(distance, step)
+    every = np.concatenate([rows, others[taken]])
+    return pool.z[every], pool.at.corrected[every], drawn
+
+
+def _judged(runs: FEMRuns, answers: FEMRuns, predicted: np.ndarray, drawn: int) -> Round:
+    """Return what a round's answers at its first ``drawn`` points say of what was predicted."""
+    every = FEMRuns.joined([runs, answers])
+    least = least_likely(every.fem.max(), every.z.shape[1], _LIKELY)
+    with np.errstate(invalid="ignore"):
+        missed = (answers.fem - predicted[: len(answers.fem)])[:drawn]
+    missed = missed[np.maximum(answers.fem, predicted[: len(answers.fem)])[:drawn] > least]
+    failed = int((~every.converged).sum())
+    size = float(np.sqrt(np.mean(missed**2))) if missed.size else np.inf
+    return Round(len(every.z), failed, size)
+
+
+def _runs_of(kept: Mapping[bytes, Field]) -> Runs:
+    """Return the solutions, the last first: where there are too many, the first go."""
+    thetas, fields = list(kept)[::-1], list(kept.values())[::-1]
+    return Runs(
+        jnp.asarray([np.frombuffer(theta) for theta in thetas]),
+        jnp.stack([jnp.asarray(field.displacement) for field in fields]),
+        jnp.full(len(fields), jnp.nan),
+        jnp.stack([jnp.asarray(field.sensitivities) for field in fields]),
+    )
+
+
+def _write(path: Path, kept: Mapping[bytes, Field], fingerprint: str) -> None:
+    """Write solutions of the scene of ``fingerprint``."""
+    runs = _runs_of(kept)._asdict()
+    arrays = {name: np.asarray(runs[name])[::-1] for name in _ARRAYS}
+    save_arrays(path, {n: np.ascontiguousarray(a) for n, a in arrays.items()}, {"of": fingerprint})
+
+
+def _read(path: Path, fingerprint: str) -> dict[bytes, Field]:
+    """Return the solutions that a search of the same scene left; none where there are none."""
+    if not path.is_file():
+        return {}
+    arrays, metadata = read_arrays(path)
+    if metadata.get("of") != fingerprint or not set(_ARRAYS) <= set(arrays):
+        return {}
+    thetas, *fields = (arrays[name] for name in _ARRAYS)
+    rows = zip(*fields, strict=True)
+    return {theta.tobytes(): Field(*row) for theta, row in zip(thetas, rows, strict=True)}

@@ -1,0 +1,157 @@
+"""Rounds of FEM runs find a posterior that nobody's range contains, and teach an emulator there."""
+
+import json
+
+import numpy as np
+import pytest
+
+import emulator as em
+from calibrate.cli import main
+from calibrate.priors import Population
+from calibrate.priors.wide import completed, wide_prior, widened
+from calibrate.project import (
+    Run,
+    by_rounds,
+    infer,
+    model_before_data,
+    read_posterior,
+    read_problem,
+    simulator_of,
+)
+from calibrate.statistical_model.fem_likelihood import FEMLikelihood
+from emulator.core.errors import InputError, SolverError
+from emulator.fem.campaign import workers
+from emulator.scenes.built_in import BUILT_IN
+
+BEAM = "once_clamped_beam"
+# The beam's range is 50 to 100 kPa in both moduli; neither is in it.
+TRUTH = {"mu": 190.0, "lam": 33.0}
+RUN = Run(
+    BEAM, forward="rounds", truth=TRUTH, observe="nodes:9", noise={"displacement": 0.2},
+    draws=500, seed=3,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module", autouse=True)
+def coarse():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(
+            BUILT_IN, BEAM, lambda **_: em.scenes.once_clamped_beam(cells=(4, 1, 1), order=1)
+        )
+        yield
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, coarse):
+    path = tmp_path_factory.mktemp("rounds") / "r"
+    infer(RUN, path, check_map=False)
+    return path
+
+
+def test_a_truth_outside_of_the_range_is_found_by_few_runs(folder):
+    _, posterior = read_posterior(folder)
+    table = posterior.summary()
+    for name, value in TRUTH.items():
+        assert abs(table[name]["mean"] - value) < 3.0 * table[name]["sd"], name
+    assert table["mu"]["sd"] < 20.0  # it is learned, not the prior's
+    record = json.loads(posterior.tree.attrs["rounds"])
+    assert record[-1]["runs"] <= 40
+    assert record[-1]["missed"] < 0.15
+
+
+def test_the_emulator_is_fem_at_its_draws(folder):
+    _, posterior = read_posterior(folder)
+    fem = FEMLikelihood(posterior.model, simulator_of(posterior.model.forward.scene))
+    draws = posterior.draws()
+    some = [{n: float(v[k]) for n, v in draws.items()} for k in range(0, 2000, 250)]
+    answers = [one for _, one in fem.many(some, posterior.data)]
+    assert np.std([one.fem - one.cheap for one in answers]) < 0.1
+
+
+def test_what_was_saved_is_read_again(folder):
+    run, posterior = read_posterior(folder)
+    assert run.forward == posterior.model.forward.kind == "rounds"
+    assert set(run.prior["median"]) == {"mu", "lam"}
+    space = {p.name: p for p in posterior.model.forward.scene.parameters}
+    assert space["mu"].low < 10.0 < 500.0 < space["mu"].high
+
+
+def test_a_search_that_was_killed_goes_on_to_the_same_posterior(folder, tmp_path, monkeypatch):
+    """What was solved before is not solved again."""
+    solve, solved = workers.Solver.__call__, []
+
+    def stopping(solver, task):
+        if len(solved) == 20:
+            raise KeyboardInterrupt
+        solved.append(task.number)
+        return solve(solver, task)
+
+    monkeypatch.setattr(workers.Solver, "__call__", stopping)
+    with pytest.raises(KeyboardInterrupt):
+        infer(RUN, tmp_path / "r", check_map=False)
+    solved.clear()
+    monkeypatch.setattr(
+        workers.Solver, "__call__", lambda solver, task: solved.append(1) or solve(solver, task)
+    )
+    again = infer(RUN, tmp_path / "r", check_map=False)
+    _, before = read_posterior(folder)
+    assert len(solved) == json.loads(before.tree.attrs["rounds"])[-1]["runs"] - 18
+    np.testing.assert_allclose(again.draws()["mu"], before.draws()["mu"], rtol=1e-6)
+    assert not (tmp_path / "r" / "solutions.safetensors").exists()
+
+
+def test_only_a_scene_without_an_emulator_gets_rounds():
+    problem = read_problem(Run(BEAM, truth={"mu": 70.0, "lam": 70.0}, observe="nodes:9"))
+    assert by_rounds(problem) is problem
+    with pytest.raises(InputError, match="calibrate infer makes it"):
+        model_before_data(RUN)
+
+
+def test_a_wide_prior_has_the_range_as_one_sd_and_keeps_what_is_stated():
+    scene = em.scenes.once_clamped_beam(cells=(4, 1, 1), order=1)
+    wide = wide_prior(scene, bounded=["lam"])
+    assert wide.median == pytest.approx({"mu": np.sqrt(5000.0)})
+    assert wide.log_sd["mu"] == pytest.approx(np.log(2.0))  # 50 to 100 kPa is half of that
+    stated = Population({"mu": 20.0}, {"mu": 0.3})
+    both = completed(stated, wide_prior(scene))
+    assert both.median["mu"] == 20.0
+    assert both.log_sd["mu"] == 0.3
+    assert set(both.median) == {"mu", "lam"}
+    space = {p.name: p for p in widened(scene, both).parameters}
+    assert space["mu"].low == pytest.approx(20.0 * np.exp(-3.72 * 0.3))
+    assert completed(None, None) is None
+
+
+def test_a_prior_in_which_fem_fails_is_named(monkeypatch):
+    monkeypatch.setattr(
+        FEMLikelihood,
+        "equilibria",
+        lambda _, draws, **__: iter([(k, None) for k in range(len(draws))]),
+    )
+    with pytest.raises(SolverError, match="FEM fails at 10 of 10 points of the prior"):
+        infer(RUN)
+
+
+OWN = """
+mesh = "own.vtu"
+law = "neo_hookean"
+order = 2
+loads = [{kind = "gravity"}]
+supports = [{node_set = "left"}]
+parameters = {mu = {unit = "kPa", range = [50, 100]}, lam = {unit = "kPa", range = [50, 100]}}
+"""
+
+
+def test_one_command_from_a_scene_file_and_data_to_a_verdict(tmp_path, capsys):
+    """Nobody trained anything, and the truth is at three times the end of a range."""
+    em.write_mesh(tmp_path / "own.vtu", em.generators.box((100.0, 10.0, 10.0), (8, 2, 2)))
+    (tmp_path / "own.toml").write_text(OWN)
+    words = ["--truth", "mu=300", "lam=60", "--observe", "nodes:9", "--noise", "1"]
+    run = ["infer", str(tmp_path / "own.toml"), *words, "--draws", "500"]
+    assert main([*run, "--out", str(tmp_path / "r"), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["verdict"] == "accepted"
+    assert result["rounds"][-1]["missed"] < 0.1
+    mu = result["parameters"]["mu"]
+    assert abs(mu["mean"] - 300.0) < 3.0 * mu["sd"] < 90.0
+    assert mu["of_prior"] < 0.2
