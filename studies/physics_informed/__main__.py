@@ -147,7 +147,7 @@ def network(scene: Scene, known: Runs, name: str, keep: Path | None, given: Any)
     plan = replace(recipe(name), seed=given.seed)
     sizes = SMALL if small and isinstance(plan, PhysicsPlan) else None
     if small:
-        plan = plan.with_counts(steps=60, simulations=20, polish=50)
+        plan = replace(plan, steps=60, simulations=20, polish=50)
     with tempfile.TemporaryDirectory() as folder:
         budget = None if small else 60.0 * given.minutes
         emulator = train(scene, plan, folder, architecture=sizes, budget=budget)

@@ -65,6 +65,7 @@ _ZERO = 1e-12  # relative to the sum of the modes' squares
 _MEMORY = 20  # steps that L-BFGS remembers
 _AT_ONCE = 50  # iterations of L-BFGS between two evaluations of the misfit
 _ROWS = 32  # rows of a block of the product, by trial
+_BLOCKS = 4  # block rows of a symmetric product
 
 
 class BranchTargets(NamedTuple):
@@ -196,9 +197,11 @@ class ModeFit:
             targets = self.targets[:, components].reshape(len(H), -1)
             weighted_features = free * self.weighted(features)
             weighted_targets = free * self._weighted_targets[:, components].reshape(len(H), -1)
-            w = _with_ridge(features.T @ weighted_features, weighted_features.T @ targets)
+            gram = _symmetric_product(features, weighted_features)
+            w = _with_ridge(gram, weighted_features.T @ targets)
             weighted_residual = weighted_targets - weighted_features @ w
-            misfit += jnp.vdot(targets - features @ w, weighted_residual)
+            # The residual of the normal equations is the ridge's.
+            misfit += jnp.vdot(targets, weighted_residual) - _ridge(gram) * jnp.vdot(w, w)
             size += jnp.vdot(targets, weighted_targets)
             derivative -= 2.0 * (weighted_residual @ w.T)
             W = W.at[:, jnp.array(components)].set(w.reshape(len(w), len(components), -1))
@@ -298,7 +301,7 @@ class ModeFit:
         many = jax.jit(lambda carry: jax.lax.scan(iterate, carry, None, length=_AT_ONCE))
         carry, measure = (branch, solver.init(branch)), jax.jit(misfit)
         best_branch, least = branch, float(measure(branch))
-        with counting(desc="L-BFGS", total=iterations, disable=not progress) as bar:
+        with counting(desc="fit of coefficients", total=iterations, disable=not progress) as bar:
             for _ in range(iterations // _AT_ONCE):
                 carry, _ = many(carry)
                 value = float(measure(carry[0]))
@@ -306,7 +309,7 @@ class ModeFit:
                     break
                 best_branch, least = carry[0], value
                 bar.update(_AT_ONCE)
-                bar.set_postfix(misfit=f"{np.exp(least):.3e}")
+                bar.set_postfix_str(f"misfit {np.exp(0.5 * least):.1e} of their size")
                 if time.perf_counter() > deadline:
                     break
         single = jax.tree.map(lambda w: w.astype(jnp.float32), best_branch)
@@ -317,8 +320,23 @@ class ModeFit:
 
 def _with_ridge(gram: jax.Array, right: jax.Array) -> jax.Array:
     """Return the solution (h, k) of normal equations, ``gram`` (h, h) with a little ridge."""
-    ridge = _RIDGE * jnp.trace(gram) / len(gram) * jnp.eye(len(gram))
-    return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(gram + ridge), right)
+    shifted = gram + _ridge(gram) * jnp.eye(len(gram))
+    return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(shifted), right)
+
+
+def _ridge(gram: jax.Array) -> jax.Array:
+    return _RIDGE * jnp.trace(gram) / len(gram)
+
+
+def _symmetric_product(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Return ``a.T @ b`` (h, h), which is symmetric, from its blocks on and above the diagonal."""
+    width = -(-a.shape[1] // _BLOCKS)
+    rows = [
+        jnp.pad(a[:, k : k + width].T @ b[:, k:], ((0, 0), (k, 0)))
+        for k in range(0, a.shape[1], width)
+    ]
+    upper = jnp.triu(jnp.concatenate(rows))
+    return upper + jnp.triu(upper, 1).T
 
 
 class BlockedMatrix(NamedTuple):

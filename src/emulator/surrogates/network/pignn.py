@@ -42,6 +42,8 @@ class Architecture:
         over the edges it ``receives``, as the released code has it.
     trunk, branch : the widths of the hidden layers below the learned modes and below the
         coefficients of a separable decoder; ``hidden`` where empty.
+    branch_activation : the function between the layers of the branch; swish is smooth, and CELU,
+        which all other networks have, has a kink in its second derivative.
     """
 
     steps: int = 5
@@ -52,6 +54,7 @@ class Architecture:
     edge_sum: Literal["antisymmetric", "receives"] = "antisymmetric"
     trunk: tuple[int, ...] = ()
     branch: tuple[int, ...] = ()
+    branch_activation: Literal["celu", "swish"] = "celu"
 
     def __post_init__(self) -> None:
         if self.decoder not in ("pointwise", "separable"):
@@ -61,7 +64,7 @@ class Architecture:
 
 
 class MLP(nnx.Module):
-    """Dense layers with CELU between them, on an input concatenated from several parts.
+    """Dense layers with an activation between them, on an input concatenated from several parts.
 
     The first layer is linear in each part, ``[a, b] @ W = a @ W_a + b @ W_b``, so a part shared by
     many rows (theta by all nodes, a node by all its edges) is multiplied once and the product
@@ -74,6 +77,7 @@ class MLP(nnx.Module):
     out : the width of the output.
     layer_norm : whether to normalise the output (encoders and processor; not decoders).
     zero_last : whether the last layer starts at zero.
+    activation : the name of the activation in ``jax.nn``.
     """
 
     def __init__(
@@ -84,9 +88,10 @@ class MLP(nnx.Module):
         *,
         layer_norm: bool,
         zero_last: bool = False,
+        activation: str = "celu",
         rngs: nnx.Rngs,
     ) -> None:
-        self.parts = parts
+        self.parts, self.activation = parts, activation
         widths = (sum(parts), *hidden, out)
         linear = partial(nnx.Linear, param_dtype=jnp.float32, rngs=rngs)
         layers = [linear(a, b) for a, b in pairwise(widths)]
@@ -108,7 +113,10 @@ class MLP(nnx.Module):
 
     def hidden(self, *values: jax.Array) -> jax.Array:
         """Return the last hidden layer (..., hidden[-1]), from all parts."""
-        return jax.nn.celu(self._before(self._first(values), len(self.layers) - 1))
+        return self._activate(self._before(self._first(values), len(self.layers) - 1))
+
+    def _activate(self, x: jax.Array) -> jax.Array:
+        return getattr(jax.nn, self.activation)(x)
 
     def _first(self, values: tuple[jax.Array, ...]) -> jax.Array:
         return reduce(jnp.add, (self.project(k, v) for k, v in enumerate(values)))
@@ -118,7 +126,7 @@ class MLP(nnx.Module):
         bias = self.layers[0].bias
         x = first if bias is None else first + bias
         for layer in self.layers[1:stop]:
-            x = layer(jax.nn.celu(x))
+            x = layer(self._activate(x))
         return x
 
     def __call__(self, *values: jax.Array) -> jax.Array:
@@ -218,7 +226,10 @@ class PointwiseDecoder(nnx.Module):
 def branch(parts: tuple[int, ...], out: int, architecture: Architecture, rngs: nnx.Rngs) -> MLP:
     """Return the network of the coefficients, zero before training."""
     widths = architecture.branch or architecture.hidden
-    return MLP(parts, widths, out, layer_norm=False, zero_last=True, rngs=rngs)
+    activation = architecture.branch_activation
+    return MLP(
+        parts, widths, out, layer_norm=False, zero_last=True, activation=activation, rngs=rngs
+    )
 
 
 def trunk(
