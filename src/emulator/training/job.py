@@ -1,13 +1,17 @@
-"""One training: its inputs, its clock, and the folder from which it goes on after a kill."""
+"""One training: its recipe, its inputs, its clock, and the folder from which it is resumed.
+
+A recipe is a frozen dataclass of its options and a function that trains by them, in a file of its
+own; all of them are listed in :mod:`emulator.training.trainer`.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -132,6 +136,16 @@ class Job:
         if stored is None:
             return runs
         return jax.tree.map(lambda *both: jnp.concatenate(both), runs, stored)
+
+
+class Recipe(NamedTuple):
+    """A recipe: its options, with their default values, and its function.
+
+    train : from the plan and the job to the trained emulator, with its record.
+    """
+
+    options: Plan
+    train: Callable[[Any, Job], Emulator]
 
 
 def _first_runs(stored: Runs, plan: Plan) -> Runs:

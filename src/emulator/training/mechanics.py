@@ -21,8 +21,8 @@ from emulator.scenes.scene import Scene, all_nodes
 from emulator.surrogates.discrepancy import fit_discrepancy
 from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.taylor import Expansion, constant, expand
-from emulator.training.job import FEM_SHARE, FEWEST, Job
-from emulator.training.plan import Plan, Recipe, check_order, check_runs
+from emulator.training.job import FEM_SHARE, FEWEST, Job, Recipe
+from emulator.training.plan import Plan, check_order, check_runs
 
 _HELD_OUT = 5  # every fifth run is held out
 _OBSERVATIONS = 4000  # values and derivatives; their covariance matrix takes 128 MB

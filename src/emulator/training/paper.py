@@ -25,7 +25,7 @@ from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.network import fresh
 from emulator.surrogates.network.graph import augment
 from emulator.surrogates.network.pignn import Architecture
-from emulator.training.job import Job
+from emulator.training.job import Job, Recipe
 from emulator.training.optimiser import (
     NetworkTraining,
     PreparedTraining,
@@ -34,7 +34,7 @@ from emulator.training.optimiser import (
     halves,
     train_network,
 )
-from emulator.training.plan import Plan, Recipe, check_rate
+from emulator.training.plan import Plan, check_rate
 
 
 @dataclass(frozen=True)

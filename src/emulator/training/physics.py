@@ -22,7 +22,7 @@ from emulator.surrogates.network import fresh
 from emulator.surrogates.network.graph import augment
 from emulator.surrogates.network.pignn import Architecture
 from emulator.surrogates.taylor import constant
-from emulator.training.job import FEM_SHARE, Job
+from emulator.training.job import FEM_SHARE, Job, Recipe
 from emulator.training.mode_fit import ModeFit, scales_of
 from emulator.training.optimiser import (
     NetworkTraining,
@@ -31,7 +31,7 @@ from emulator.training.optimiser import (
     orthogonal_steps,
     train_network,
 )
-from emulator.training.plan import Plan, Recipe, check_rate, check_runs
+from emulator.training.plan import Plan, check_rate, check_runs
 from emulator.training.sweeps import check_sweeps, runs_of, sweep_box
 
 ARCHITECTURE = Architecture(

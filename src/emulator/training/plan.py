@@ -1,21 +1,12 @@
-"""The options that all recipes have, and the form of a recipe.
-
-A recipe is a frozen dataclass of its options and a function that trains by them, in a file of its
-own; all of them are listed in :mod:`emulator.training.trainer`.
-"""
+"""The options that all recipes have, and how they are checked."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 from emulator.core.errors import InputError, check_seed
-
-if TYPE_CHECKING:
-    from emulator.surrogates.emulator import Emulator
-    from emulator.training.job import Job
 
 
 @dataclass(frozen=True)
@@ -58,16 +49,6 @@ class Plan:
                 raise InputError(
                     f"training: {name} is {getattr(self, name)}; it must be {least} or more"
                 )
-
-
-class Recipe(NamedTuple):
-    """A recipe: its options, with their default values, and its function.
-
-    train : from the plan and the job to the trained emulator, with its record.
-    """
-
-    options: Plan
-    train: Callable[[Any, Job], Emulator]
 
 
 def check_runs(simulations: int, needed_by: str = "a discrepancy model needs") -> None:

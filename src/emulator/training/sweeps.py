@@ -58,9 +58,9 @@ from emulator.surrogates.polynomial import (
     terms,
 )
 from emulator.surrogates.taylor import expand
-from emulator.training.job import Job
+from emulator.training.job import Job, Recipe
 from emulator.training.mechanics import anchored, family_on, of_position
-from emulator.training.plan import Plan, Recipe, check_order
+from emulator.training.plan import Plan, check_order
 from emulator.training.targets import Map, free_fields, targets
 from emulator.training.two_meshes import on_finer
 

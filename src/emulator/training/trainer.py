@@ -33,9 +33,9 @@ from emulator.fem.campaign import StoredRuns
 from emulator.scenes.scene import Scene
 from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.network.pignn import Architecture
-from emulator.training.job import DESCRIPTION, Job
+from emulator.training.job import DESCRIPTION, Job, Recipe
 from emulator.training.mechanics import MECHANICS
-from emulator.training.plan import Plan, Recipe
+from emulator.training.plan import Plan
 from emulator.training.two_meshes import TWO_MESHES
 
 _FOLDER = "checkpoint"

@@ -14,9 +14,9 @@ from emulator.core.errors import InputError
 from emulator.scenes.scene import Scene
 from emulator.surrogates.coarse import carried
 from emulator.surrogates.emulator import Emulator, load, save_emulator
-from emulator.training.job import FEM_SHARE, Job
+from emulator.training.job import FEM_SHARE, Job, Recipe
 from emulator.training.mechanics import Mechanics, add_discrepancy, of_position, train_mechanics
-from emulator.training.plan import Plan, Recipe, check_runs
+from emulator.training.plan import Plan, check_runs
 
 
 @dataclass(frozen=True)
