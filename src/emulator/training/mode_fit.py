@@ -65,7 +65,6 @@ _ZERO = 1e-12  # relative to the sum of the modes' squares
 _MEMORY = 20  # steps that L-BFGS remembers
 _AT_ONCE = 50  # iterations of L-BFGS between two evaluations of the misfit
 _ROWS = 32  # rows of a block of the product, by trial
-_BLOCKS = 4  # block rows of a symmetric product
 
 
 class BranchTargets(NamedTuple):
@@ -197,7 +196,7 @@ class ModeFit:
             targets = self.targets[:, components].reshape(len(H), -1)
             weighted_features = free * self.weighted(features)
             weighted_targets = free * self._weighted_targets[:, components].reshape(len(H), -1)
-            gram = _symmetric_product(features, weighted_features)
+            gram = features.T @ weighted_features
             w = _with_ridge(gram, weighted_features.T @ targets)
             weighted_residual = weighted_targets - weighted_features @ w
             # The residual of the normal equations is the ridge's.
@@ -326,17 +325,6 @@ def _with_ridge(gram: jax.Array, right: jax.Array) -> jax.Array:
 
 def _ridge(gram: jax.Array) -> jax.Array:
     return _RIDGE * jnp.trace(gram) / len(gram)
-
-
-def _symmetric_product(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Return ``a.T @ b`` (h, h), which is symmetric, from its blocks on and above the diagonal."""
-    width = -(-a.shape[1] // _BLOCKS)
-    rows = [
-        jnp.pad(a[:, k : k + width].T @ b[:, k:], ((0, 0), (k, 0)))
-        for k in range(0, a.shape[1], width)
-    ]
-    upper = jnp.triu(jnp.concatenate(rows))
-    return upper + jnp.triu(upper, 1).T
 
 
 class BlockedMatrix(NamedTuple):

@@ -65,7 +65,7 @@ class PhysicsPlan(Plan):
     learning_rate: float = 2e-3
     sweeps: int = 60
     simulations: int = 400
-    polish: int = 3000
+    polish: int = 600
 
     def __post_init__(self) -> None:
         super().__post_init__()

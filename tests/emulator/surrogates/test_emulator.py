@@ -208,3 +208,5 @@ def test_an_unknown_decoder_or_edge_sum():
         Architecture(decoder="dense")
     with pytest.raises(em.InputError, match="edge sum 'all': use antisymmetric or receives"):
         Architecture(edge_sum="all")
+    with pytest.raises(em.InputError, match="activation 'step': use celu or swish"):
+        Architecture(branch_activation="step")

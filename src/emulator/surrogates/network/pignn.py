@@ -61,6 +61,8 @@ class Architecture:
             raise InputError(f"decoder '{self.decoder}': use pointwise or separable")
         if self.edge_sum not in ("antisymmetric", "receives"):
             raise InputError(f"edge sum '{self.edge_sum}': use antisymmetric or receives")
+        if self.branch_activation not in ("celu", "swish"):
+            raise InputError(f"activation '{self.branch_activation}': use celu or swish")
 
 
 class MLP(nnx.Module):
