@@ -161,15 +161,13 @@ def sweep_box(
     state = checkpoint.restore(lambda: _at_rest(simulator))
     if state is None:
         state = _initial_state(simulator, starts, 0, beneath)
-    begin = state.number
-    with counting(desc="sweeps", initial=begin, total=sweeps, disable=not progress) as bar:
+    with counting(desc="sweeps", initial=state.number, total=sweeps, disable=not progress) as bar:
         while state.number < sweeps and not state.done:
             if time.perf_counter() > deadline:
                 if state.level == 1.0:
                     break
                 require_time(f"{state.number} sweeps at {100 * state.level:.0f} % of the loads")
-            first = state.number == begin
-            state, display = _sweep(simulator, state, seed, beneath, first=first)
+            state, display = _sweep(simulator, state, seed, beneath, first=bar.n == bar.initial)
             if state.lost < len(starts) and state.level == 1.0 and not np.isfinite(state.error):
                 state = _initial_state(simulator, starts, state.lost + 1)._replace(
                     number=state.number

@@ -78,32 +78,21 @@ def train(
     ----------
     scene : the scene to emulate.
     plan : the recipe and its options, e.g. ``recipe("mechanics")``.
-    folder : the folder of the checkpoint. The finished emulator is returned, not written; remove
-        the last checkpoint with :func:`remove_checkpoint` once it is safe.
+    folder : the folder of the checkpoint; :func:`remove_checkpoint` once the emulator is saved.
     architecture : the sizes of the network; by default the recipe's.
     start : the emulator to begin from: of recipes sweeps and mechanics, one with the network of a
-        family of bodies; of sweeps and two_meshes, that on the coarser mesh, which recipe mechanics
-        makes for two_meshes if none is given.
+        family of bodies; of sweeps and two_meshes, that on the coarser mesh.
     campaign : FEM runs to take the first ``plan.simulations`` of, instead of making them; needed
         again to resume.
-    budget : seconds for everything (FEM runs, compilation, training). It replaces ``plan.steps`` by
-        as many as fit, estimated again as the machine gets busier or less so, and
-        ``plan.simulations`` by as many as were done in its first third.
+    budget : seconds for everything, compilation included. It replaces ``plan.steps`` by as many as
+        fit, and ``plan.simulations`` by as many as were done in its first third.
     progress : whether progress is shown.
-    resume : continue from the checkpoint in ``folder``, under the plan it was written with;
-        ``architecture`` is left out, ``start`` is needed again. Without a budget the result equals
-        that of a training never interrupted. One on a budget has what was left of it, or the new
-        ``budget`` from now on.
+    resume : continue from the checkpoint, under its plan and sizes; ``start`` is needed again.
+        Without a budget the result equals that of a training never interrupted. One on a budget
+        has what was left of it, or the new ``budget`` from now on.
     """
-    if campaign is not None and not (plan.runs or resume):
-        raise InputError(f"training: recipe '{plan.recipe}' takes no FEM runs, so no campaign")
-    if architecture is not None and not (plan.trains_network or resume):
-        raise InputError(f"training: recipe '{plan.recipe}' trains no network, so no architecture")
-    if start is not None and plan.trains_network:
-        raise InputError(
-            f"training: recipe '{plan.recipe}' trains its network from nothing, so it has no "
-            "start; sweeps and mechanics begin from the network of a family of bodies"
-        )
+    if not resume:
+        _check_inputs(plan, architecture, start, campaign)
     identity: dict[str, Any] = {
         "format": FORMAT,
         "scene": scene.fingerprint,
@@ -128,13 +117,27 @@ def train(
     emulator = RECIPES[plan.recipe].train(plan, job)
     record = {**emulator.record, "seconds": round(job.seconds, 1)}
     if start is not None:
-        source = start.scene
-        record["start"] = {
-            "scene": source.name,
-            "scene_fingerprint": source.fingerprint,
-            "fingerprint": start.fingerprint,
-        }
+        of = {"scene": start.scene.name, "scene_fingerprint": start.scene.fingerprint}
+        record["start"] = {**of, "fingerprint": start.fingerprint}
     return replace(emulator, record=record)
+
+
+def _check_inputs(
+    plan: Plan,
+    architecture: Architecture | None,
+    start: Emulator | None,
+    campaign: StoredRuns | None,
+) -> None:
+    """Refuse what the recipe has no use for."""
+    if campaign is not None and not plan.runs:
+        raise InputError(f"training: recipe '{plan.recipe}' takes no FEM runs, so no campaign")
+    if architecture is not None and not plan.trains_network:
+        raise InputError(f"training: recipe '{plan.recipe}' trains no network, so no architecture")
+    if start is not None and plan.trains_network:
+        raise InputError(
+            f"training: recipe '{plan.recipe}' trains its network from nothing, so it has no "
+            "start; sweeps and mechanics begin from the network of a family of bodies"
+        )
 
 
 def _description(path: Path, name: str, now: Mapping[str, Any]) -> dict[str, Any]:
