@@ -167,7 +167,7 @@ def sweep_box(
                 if state.level == 1.0:
                     break
                 require_time(f"{state.number} sweeps at {100 * state.level:.0f} % of the loads")
-            state, display = _sweep(simulator, state, seed, beneath, first=bar.n == bar.initial)
+            state, display = _sweep(simulator, state, seed, beneath)
             if state.lost < len(starts) and state.level == 1.0 and not np.isfinite(state.error):
                 state = _initial_state(simulator, starts, state.lost + 1)._replace(
                     number=state.number
@@ -245,7 +245,7 @@ def _initial_state(
 
 
 def _sweep(
-    simulator: Simulator, state: SweepState, seed: int, beneath: Map | None, *, first: bool
+    simulator: Simulator, state: SweepState, seed: int, beneath: Map | None
 ) -> tuple[SweepState, dict[str, Any]]:
     """Return the state after one sweep, and the numbers that the progress bar shows."""
     from scipy.stats import qmc  # slow to import, and only for sweeps
@@ -257,7 +257,9 @@ def _sweep(
     position = qmc.Sobol(parameters, rng=rng).random(count)
     level, extrapolation = _next_level(state) if state.rises else (state.level, state.polynomial)
     below = 0.0 if beneath is None else free_fields(simulator, beneath, position)
-    steps = targets(simulator, below + extrapolation.at(position), position, level, first=first)
+    steps = targets(
+        simulator, below + extrapolation.at(position), position, level, first=state.number == 0
+    )
     usable = np.isfinite(steps.error)
     usable_share = float(np.mean(usable & (steps.fraction >= _LEAST_FRACTION)))
     display = {"load": f"{level:.2f}", "taken": f"{usable_share:.2f}"}
