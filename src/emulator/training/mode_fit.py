@@ -196,11 +196,9 @@ class ModeFit:
             targets = self.targets[:, components].reshape(len(H), -1)
             weighted_features = free * self.weighted(features)
             weighted_targets = free * self._weighted_targets[:, components].reshape(len(H), -1)
-            gram = features.T @ weighted_features
-            w = _with_ridge(gram, weighted_features.T @ targets)
+            w = _with_ridge(features.T @ weighted_features, weighted_features.T @ targets)
             weighted_residual = weighted_targets - weighted_features @ w
-            # The residual of the normal equations is the ridge's.
-            misfit += jnp.vdot(targets, weighted_residual) - _ridge(gram) * jnp.vdot(w, w)
+            misfit += jnp.vdot(targets - features @ w, weighted_residual)
             size += jnp.vdot(targets, weighted_targets)
             derivative -= 2.0 * (weighted_residual @ w.T)
             W = W.at[:, jnp.array(components)].set(w.reshape(len(w), len(components), -1))
@@ -319,12 +317,8 @@ class ModeFit:
 
 def _with_ridge(gram: jax.Array, right: jax.Array) -> jax.Array:
     """Return the solution (h, k) of normal equations, ``gram`` (h, h) with a little ridge."""
-    shifted = gram + _ridge(gram) * jnp.eye(len(gram))
-    return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(shifted), right)
-
-
-def _ridge(gram: jax.Array) -> jax.Array:
-    return _RIDGE * jnp.trace(gram) / len(gram)
+    ridge = _RIDGE * jnp.trace(gram) / len(gram) * jnp.eye(len(gram))
+    return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(gram + ridge), right)
 
 
 class BlockedMatrix(NamedTuple):

@@ -102,7 +102,7 @@ def prepare(plan: PhysicsPlan, job: Job) -> PreparedTraining:
         orthogonal_steps(),
         cosine(plan.learning_rate),
         fit.descend,
-        lambda loss: f"misfit of modes and gradients {np.sqrt(loss):.1e} of their size",
+        lambda loss: f"misfit of modes and gradients {abs(loss) ** 0.5:.1e} of their size",
         partial(fit.finish, plan.polish, job.deadline(_POLISH_SHARE)),
     )
     emulator = Emulator(scene, taylor=series, network=network)
