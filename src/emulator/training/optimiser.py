@@ -20,7 +20,7 @@ from flax import nnx
 
 from emulator.core.checkpoint import Checkpoint
 from emulator.core.display import counting
-from emulator.core.errors import InputError, SolverError
+from emulator.core.errors import SolverError
 from emulator.fem.campaign import Runs
 from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.network import Network
@@ -270,7 +270,7 @@ class StepLimit:
     def __call__(self, state: State) -> int:
         """Return the number of steps that follows from the time the last ones took.
 
-        :class:`InputError` where fewer steps fit than a warm-up takes.
+        It is a warm-up's at least: fewer would leave a network that knows nothing.
         """
         steps = state.done - self._first
         if self._first < 0:  # the first step compiles: the clock starts after it
@@ -280,12 +280,5 @@ class StepLimit:
             jax.block_until_ready(state.loss)
             now = time.perf_counter()
             one = (now - self._began) / steps
-            total = state.done + max(int((self._deadline - now) / one), 0)
-            if total < WARMUP:
-                raise InputError(
-                    f"the budget leaves {total} training steps of {1e3 * one:.0f} ms after "
-                    f"equilibria and compilation; give at least {(WARMUP - total) * one:.0f} s "
-                    "more: what is there is kept, go on with --resume --budget TIME"
-                )
-            return total
+            return max(state.done + max(int((self._deadline - now) / one), 0), WARMUP)
         return state.total

@@ -138,13 +138,13 @@ def test_a_budget_too_small_says_how_much_more(beam, tmp_path):
     """What 5 s are enough for is the machine's business, and what it has compiled before."""
     with pytest.raises(InputError, match="a budget of 1 s: one FEM solution and its compilation"):
         train(beam, Paper(), tmp_path, architecture=SMALL, budget=1.0)
-    over = r"the budget leaves \d+ training steps .* give at least|the budget of 5 s is over after"
+    over = "the budget of 5 s is over after"
     try:
         emulator = train(beam, Paper(), tmp_path, architecture=SMALL, budget=5.0)
     except InputError as error:
         assert re.search(over, str(error))  # noqa: PT017 - it may also be enough
     else:
-        assert emulator.record["plan"]["steps"] > WARMUP
+        assert emulator.record["plan"]["steps"] >= WARMUP
 
 
 @pytest.mark.parametrize(
@@ -257,8 +257,7 @@ def test_an_aim_follows_the_clock(monkeypatch):
     short = module.StepLimit(260.0)
     short(State({}, (), 3000, 1, 0.0))
     now[0] = 210.0
-    with pytest.raises(InputError, match="leaves 61 training steps of 1000 ms .* at least 39 s"):
-        short(State({}, (), 3000, 11, 0.0))
+    assert short(State({}, (), 3000, 11, 0.0)) == WARMUP
 
 
 @pytest.mark.slow
