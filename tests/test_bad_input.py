@@ -23,8 +23,8 @@ from cli_support import write_block
 from emulator.core.errors import InputError
 from emulator.surrogates.emulator import SHIPPED
 from emulator.training import recipe
+from emulator.training.job import Job
 from emulator.training.paper import Paper
-from emulator.training.plan import Job
 from linear_support import linear_forward
 
 BEAM = em.scenes.once_clamped_beam(cells=(4, 2, 2), order=1)

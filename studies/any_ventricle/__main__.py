@@ -36,7 +36,6 @@ from calibrate.provenance import hardware, versions
 from emulator.scenes.built_in.ventricles import left_ventricle
 from emulator.surrogates import Emulator, save_emulator
 from emulator.surrogates.network.family import FamilyNetwork
-from emulator.training.checkpoint import CHECKPOINT
 
 HERE = Path(__file__).parent
 SEED, TESTS = 0, 5
@@ -66,8 +65,9 @@ def train(given: argparse.Namespace) -> None:
     seconds, steps = 0.0, given.steps
     for seed in range(MEMBERS) if given.member is None else (given.member,):
         plan, folder = replace(PLAN, steps=steps, seed=seed), given.out / f"member_{seed}"
-        resume = given.resume and (folder / CHECKPOINT).is_file()
-        trained = train_family(family, digest, plan, folder, home, progress=True, resume=resume)
+        trained = train_family(
+            family, digest, plan, folder, home, progress=True, resume=given.resume
+        )
         assert trained.family is not None
         members += trained.family.learned.members
         seconds += trained.record["seconds"]

@@ -18,8 +18,9 @@ unknown follows from the numbering of its nodes.
 from __future__ import annotations
 
 import hashlib
+import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -28,6 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
+from emulator.core.checkpoint import Checkpoint
 from emulator.core.errors import InputError
 from emulator.fem.linear_response import pressure_force
 from emulator.geometry.discretisation import shapes_at
@@ -45,8 +47,7 @@ from emulator.surrogates.network.family import (
 )
 from emulator.surrogates.network.graph import AugmentedGraph
 from emulator.surrogates.network.pignn import Architecture
-from emulator.training.checkpoint import CHECKPOINT, Session, State
-from emulator.training.optimiser import cosine, make_step, orthogonal_steps, run
+from emulator.training.optimiser import State, cosine, make_step, orthogonal_steps, run
 from emulator.training.plan import Plan
 
 ARCHITECTURE = Architecture(
@@ -66,13 +67,11 @@ class FamilyPlan(Plan):
     """The options of the training.
 
     steps, learning_rate : the number of optimiser steps, and the largest learning rate.
-    checkpoint_every : the number of steps between two checkpoints.
     """
 
     recipe: str = "ventricles"
     steps: int = 20_000
     learning_rate: float = 7e-4
-    checkpoint_every: int = 500
 
 
 PLAN = FamilyPlan()
@@ -342,10 +341,11 @@ def train_family(
     folder : where checkpoints go. told : called with the state after each step.
     """
     learned, bodies = family.learned, family.bodies
-    session = Session(Path(folder) / CHECKPOINT, fingerprint, plan, learned.architecture)
-    if resume:
-        session = session.resumed(f"{len(bodies)} bodies", {plan.recipe: FamilyPlan})
-    plan = cast(FamilyPlan, session.plan)
+    identity = {"bodies": fingerprint, "plan": asdict(plan)}
+    checkpoint = Checkpoint(Path(folder) / "steps.safetensors", identity)
+    if not resume:
+        checkpoint.remove()
+    began = time.perf_counter()
     module = FamilyModule(learned.architecture, learned.widths, plan.seed)
     definition, weights = nnx.split(module)
     step = make_step(
@@ -354,21 +354,20 @@ def train_family(
         orthogonal_steps(),
     )
 
-    def advance(state: State, total: int) -> State:
+    def advance(state: State) -> State:
         body = bodies[_taken(state.done, len(bodies), plan.seed)]
-        weights, moments, loss = step(
-            state.weights, state.optimiser, jnp.asarray(state.done), jnp.asarray(total), body
-        )
-        state = State(weights, moments, state.done + 1, loss)
-        told(state, total)
+        numbers = jnp.asarray(state.done), jnp.asarray(state.total)
+        weights, moments, loss = step(state.weights, state.optimiser, *numbers, body)
+        state = State(weights, moments, state.total, state.done + 1, loss)
+        told(state, state.total)
         return state
 
-    state = State(weights, orthogonal_steps().init(weights))
-    state = run(session, state, plan.steps, advance, progress=progress)
+    state = State(weights, orthogonal_steps().init(weights), plan.steps)
+    state = run(checkpoint, state, advance, progress=progress)
     record: dict[str, Any] = {
         **plan.record(state.loss),
         "bodies": len(bodies),
-        "seconds": round(session.seconds, 1),
+        "seconds": round(time.perf_counter() - began, 1),
     }
     part = FamilyNetwork(learned._replace(members=(state.weights,)), home)
     return Emulator(home, family=part, record=record)

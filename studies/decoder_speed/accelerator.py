@@ -22,8 +22,8 @@ from calibrate.samplers.smc import SMCOptions
 from calibrate.statistical_model import Data, Model
 from calibrate.statistical_model.density import density_of
 from emulator.core.store import write_json
-from emulator.training.paper import Paper
-from emulator.training.plan import Job
+from emulator.training.job import Job
+from emulator.training.paper import Paper, prepare
 
 HERE = Path(__file__).parent
 SEED = 12
@@ -54,14 +54,14 @@ def step_s(device: jax.Device, batch: int, steps: int) -> float:
     """Seconds of a step of the paper's training, ``batch`` theta each, prepared on the CPU."""
     plan = Paper(steps=steps, batch=batch)
     with jax.default_device(jax.devices("cpu")[0]):
-        training = plan.prepare(Job(em.load("left_ventricle", kind="series").scene)).training
-        state = training.initial()
+        training = prepare(plan, Job(em.load("left_ventricle", kind="series").scene)).training
+        state = training.initial(steps)
     state = jax.device_put(state, device)
     for _ in range(3):
-        state = training.advance(state, steps)
+        state = training.advance(state)
     began = time.perf_counter()
     for _ in range(steps):
-        state = training.advance(jax.block_until_ready(state), steps)
+        state = training.advance(jax.block_until_ready(state))
     jax.block_until_ready(state)
     assert device in jax.tree.leaves(state.weights)[0].devices()
     return (time.perf_counter() - began) / steps

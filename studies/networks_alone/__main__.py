@@ -33,11 +33,15 @@ from emulator.core.store import write_json
 from emulator.fem import Runs, run_campaign, sobol
 from emulator.scenes import Scene
 from emulator.surrogates import Architecture, Emulator, load, shipped
+from emulator.training.job import Job
 from emulator.training.mode_fit import ModeFit, scales_of
-from emulator.training.network_plan import PreparedTraining, with_weights
-from emulator.training.optimiser import NetworkTraining, clipped_adam
-from emulator.training.physics import ARCHITECTURE, PhysicsPlan
-from emulator.training.plan import Job
+from emulator.training.optimiser import (
+    NetworkTraining,
+    PreparedTraining,
+    clipped_adam,
+    with_weights,
+)
+from emulator.training.physics import ARCHITECTURE, PhysicsPlan, prepare
 
 HERE = Path(__file__).parent
 TEST_SEED = 90_210
@@ -121,11 +125,11 @@ def trained(idea: Idea, scene: Any, seed: int, arguments: argparse.Namespace) ->
     steps, runs = arguments.steps, arguments.simulations
     plan = PhysicsPlan(sweeps=0, steps=steps, simulations=runs, seed=seed)
     plan = idea.plan(replace(plan, polish=arguments.polish))
-    problem = plan.prepare(Job(scene, SMALL if arguments.quick else ARCHITECTURE))
+    problem = prepare(plan, Job(scene, SMALL if arguments.quick else ARCHITECTURE))
     training = _with(idea, problem, plan.polish)
-    state = training.initial()
+    state = training.initial(plan.steps)
     for _ in range(plan.steps):
-        state = training.advance(state, plan.steps)
+        state = training.advance(state)
     return with_weights(problem.emulator, training.finish(state.weights, False))
 
 

@@ -31,6 +31,7 @@ from studies.physics_informed.judged import TEST_SEED, errors_of
 import calibrate as cal
 import emulator as em
 from calibrate.figures import BLUE, GREEN, ORANGE, VERMILION, pyplot
+from emulator.core.checkpoint import Checkpoint
 from emulator.fem import Runs, run_campaign, sobol
 from emulator.scenes import Scene
 from emulator.scenes.loads import PublishedPressure
@@ -94,10 +95,11 @@ def sweeping(scene: Scene, known: Runs, sweeps: int, *, centre: bool = False) ->
     starts = [] if series is None else [lambda: series]
     seconds, curve = time.perf_counter() - began, []
     with tempfile.TemporaryDirectory() as folder:
+        checkpoint = Checkpoint(Path(folder) / "sweeps.safetensors")
         for count in range(16, sweeps + 1, EVERY):
             began = time.perf_counter()
             try:
-                state = sweep_box(simulator, count, SEED, starts=starts, folder=Path(folder))
+                state = sweep_box(simulator, count, SEED, starts=starts, checkpoint=checkpoint)
             except em.SolverError:  # not yet at the whole load
                 seconds += time.perf_counter() - began
                 continue
@@ -147,7 +149,7 @@ def network(scene: Scene, known: Runs, name: str, keep: Path | None, given: Any)
     plan = replace(recipe(name), seed=given.seed)
     sizes = SMALL if small and isinstance(plan, PhysicsPlan) else None
     if small:
-        plan = plan.with_counts(steps=60, simulations=20, polish=50)
+        plan = replace(plan, steps=60, simulations=20, polish=50)
     with tempfile.TemporaryDirectory() as folder:
         budget = None if small else 60.0 * given.minutes
         emulator = train(scene, plan, folder, architecture=sizes, budget=budget)

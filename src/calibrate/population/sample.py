@@ -23,10 +23,10 @@ from calibrate.posterior import sample
 from calibrate.posterior.posterior import describe_distribution
 from calibrate.provenance import as_attributes, versions
 from calibrate.samplers import NUTSOptions, check_options
-from calibrate.samplers.checkpoint import Checkpoint, identity_of
 from calibrate.samplers.nuts import NUTS
 from calibrate.samplers.protocol import Context
 from calibrate.statistical_model import Data, Model
+from emulator.core.checkpoint import Checkpoint, identity_of
 from emulator.core.errors import check_arguments
 from emulator.core.machine import one_blas_thread
 

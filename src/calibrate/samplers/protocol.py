@@ -15,8 +15,8 @@ from typing import Any, ClassVar, NamedTuple
 
 import jax
 
-from calibrate.samplers.checkpoint import Checkpoint
 from calibrate.samplers.diagnostics import ENOUGH_ESS, RUN_UNTIL_R_HAT, converged
+from emulator.core.checkpoint import Checkpoint
 from emulator.core.errors import InputError
 
 Statistics = Mapping[str, Any]

@@ -16,90 +16,67 @@ import numpy as np
 
 from emulator.accuracy.comparison import evaluate
 from emulator.core.errors import InputError
-from emulator.fem import Simulator
 from emulator.fem.campaign import Runs
 from emulator.scenes.scene import Scene, all_nodes
 from emulator.surrogates.discrepancy import fit_discrepancy
 from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.taylor import Expansion, constant, expand
-from emulator.training.checkpoint import Record, Session
-from emulator.training.plan import FEWEST, Job, Plan, check_order, check_runs
+from emulator.training.job import FEM_SHARE, FEWEST, Job, Recipe
+from emulator.training.plan import Plan, check_order, check_runs
 
 _HELD_OUT = 5  # every fifth run is held out
 _OBSERVATIONS = 4000  # values and derivatives; their covariance matrix takes 128 MB
-FEM_SHARE = 0.3
-"""The share of a budget after which no FEM run begins."""
 
 
 @dataclass(frozen=True)
-class DiscrepancyPlan(Plan):
-    """The options of recipes that fit a discrepancy model and train no network.
-
-    simulations : the number of FEM runs on the scene's own mesh, with their sensitivities.
-    """
-
-    simulations: int = 60
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_runs(self.simulations)
-
-    def prepare(self, job: Job) -> tuple[Emulator, Runs, Expansion | None]:
-        """Return the emulator without its discrepancy model, the FEM runs, and FEM's series."""
-        raise NotImplementedError
-
-    def train(self, job: Job, session: Session) -> tuple[Emulator, Record]:
-        """Return the emulator and its record."""
-        emulator, runs, series = self.prepare(job)
-        plan = self.with_counts(simulations=len(runs.theta) - 1)
-        session.write_plan(plan)
-        emulator, choice = add_discrepancy(emulator, runs, series)
-        return emulator, {**plan.record(), "discrepancy": choice}
-
-
-@dataclass(frozen=True)
-class Mechanics(DiscrepancyPlan):
+class Mechanics(Plan):
     """A Taylor series and a discrepancy model.
 
+    simulations : the number of FEM runs, with their sensitivities.
     order : the order of the series; 0 is the FEM solution at the centre of the box.
     """
 
     recipe: str = "mechanics"
+    simulations: int = 60
     order: int = 3
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_runs(self.simulations)
         check_order(self.order)
 
-    def prepare(self, job: Job) -> tuple[Emulator, Runs, Expansion]:
-        """Return the emulator without its discrepancy model, the FEM runs, and FEM's series."""
-        scene, start = job.scene, job.start
-        if start is not None and start.family is None:
-            raise InputError(
-                f"recipe '{self.recipe}' begins from the network of a family of bodies; the "
-                f"emulator of '{start.scene.name}' has none"
-            )
-        network = None if start is None else family_on(scene, start)
-        series, runs = _series_and_runs(job, self)
-        if network is None:
-            return Emulator(scene, taylor=series), runs, series
-        return anchored(network, series), runs, series
+
+def train_mechanics(plan: Mechanics, job: Job) -> Emulator:
+    """Return the emulator and its record."""
+    emulator, runs, series = prepare(plan, job)
+    plan = replace(plan, simulations=len(runs.theta) - 1)
+    emulator, choice = add_discrepancy(emulator, runs, series)
+    return replace(emulator, record={**plan.record(), "discrepancy": choice})
 
 
-def _series_and_runs(job: Job, plan: Mechanics) -> tuple[Expansion, Runs]:
-    """Return the series about the centre of the box, rounded as a file stores it, and FEM runs.
+def prepare(plan: Mechanics, job: Job) -> tuple[Emulator, Runs, Expansion]:
+    """Return the emulator without its discrepancy model, the FEM runs, and FEM's series.
 
-    The discrepancy model is fitted to the series that is loaded from a file.
+    The series is rounded as a file stores it: the discrepancy model is fitted to the one that is
+    loaded.
     """
-    simulator = Simulator(job.scene)
-    series = expand(simulator, order=plan.order).rounded() if plan.order else None
+    scene, start = job.scene, job.start
+    if start is not None and start.family is None:
+        raise InputError(
+            f"recipe '{plan.recipe}' begins from the network of a family of bodies; the "
+            f"emulator of '{start.scene.name}' has none"
+        )
+    network = None if start is None else family_on(scene, start)
+    series = expand(job.simulator, order=plan.order).rounded() if plan.order else None
     if series is not None:
         job.require_time("the series about the centre of the box")
-    runs = job.fem_runs(simulator, plan, series, job.deadline(FEM_SHARE))
+    runs = job.fem_runs(plan, series, job.deadline(FEM_SHARE))
     job.require_time(f"{len(runs.theta)} FEM runs")
     if series is None:
-        series = constant(np.asarray(job.scene.to_unit(job.scene.centre)), runs.displacement[0])
-    return series, runs
+        series = constant(np.asarray(scene.to_unit(scene.centre)), runs.displacement[0])
+    if network is None:
+        return Emulator(scene, taylor=series), runs, series
+    return anchored(network, series), runs, series
 
 
 def add_discrepancy(
@@ -191,3 +168,6 @@ def _error(emulator: Emulator, runs: Runs) -> float:
     predicted = jax.jit(emulator.cache())(runs.theta)
     errors = jnp.mean(jnp.linalg.norm(predicted - runs.displacement, axis=-1), axis=-1)
     return float(jnp.exp(jnp.mean(jnp.log(errors + 1e-300))))
+
+
+MECHANICS = Recipe(Mechanics(), train_mechanics)

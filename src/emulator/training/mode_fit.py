@@ -298,7 +298,7 @@ class ModeFit:
         many = jax.jit(lambda carry: jax.lax.scan(iterate, carry, None, length=_AT_ONCE))
         carry, measure = (branch, solver.init(branch)), jax.jit(misfit)
         best_branch, least = branch, float(measure(branch))
-        with counting(desc="L-BFGS", total=iterations, disable=not progress) as bar:
+        with counting(desc="fit of coefficients", total=iterations, disable=not progress) as bar:
             for _ in range(iterations // _AT_ONCE):
                 carry, _ = many(carry)
                 value = float(measure(carry[0]))
@@ -306,7 +306,7 @@ class ModeFit:
                     break
                 best_branch, least = carry[0], value
                 bar.update(_AT_ONCE)
-                bar.set_postfix(misfit=f"{np.exp(least):.3e}")
+                bar.set_postfix_str(f"misfit {np.exp(0.5 * least):.1e} of their size")
                 if time.perf_counter() > deadline:
                     break
         single = jax.tree.map(lambda w: w.astype(jnp.float32), best_branch)

@@ -1,12 +1,15 @@
-"""The optimiser of a network's weights: learning rates, steps, and their loop in a time budget."""
+"""The optimiser of a network's weights: learning rates, steps, and their loop in a time budget.
+
+:func:`train_network` is the course of a training that recipes with a network have in common.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,10 +18,15 @@ import optax
 import optax.contrib
 from flax import nnx
 
+from emulator.core.checkpoint import Checkpoint
 from emulator.core.display import counting
-from emulator.core.errors import InputError, SolverError
+from emulator.core.errors import SolverError
+from emulator.fem.campaign import Runs
+from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.network import Network
-from emulator.training.checkpoint import Session, State
+from emulator.training.job import Job
+from emulator.training.plan import Plan
+from emulator.training.targets import distance_from_equilibrium
 
 WARMUP = 100  # steps in which the learning rate rises
 _LENGTH = 1.6  # root mean square of an orthogonal step of a weight; Adam's is up to 1
@@ -31,8 +39,22 @@ Rate = Callable[[jax.Array, jax.Array], jax.Array]
 """``rate(number, total)``: the learning rate of step ``number`` of ``total``."""
 Descent = Callable[..., tuple[jax.Array, Weights, Weights]]
 """``descend(weights, number, *data)``: the loss, its gradient, and the weights both belong to."""
-Advance = Callable[[State, int], State]
-"""One step: from the state and the total number of steps to the next state."""
+
+
+class State(NamedTuple):
+    """The state between two optimiser steps.
+
+    weights, optimiser : the weights of the network and the state of the optimiser.
+    total : the number of steps aimed at.
+    done : the number of steps done.
+    loss : the loss of the last step.
+    """
+
+    weights: Any
+    optimiser: Any
+    total: int
+    done: int = 0
+    loss: Any = float("nan")
 
 
 # ---- learning rates ------------------------------------------------------------------------------
@@ -118,6 +140,7 @@ class NetworkTraining:
 
     network : the untrained network.
     optimiser, rate, descend : what its steps are made of (:func:`make_step`).
+    report : from the loss to the text that shows progress.
     finish : from the weights after the last step, and whether to show progress, to the trained
         weights.
     """
@@ -126,6 +149,7 @@ class NetworkTraining:
     optimiser: optax.GradientTransformation
     rate: Rate
     descend: Descent
+    report: Callable[[float], str] = "loss {:.3e}".format
     finish: Callable[[Weights, bool], Weights] = lambda weights, _: weights
 
     @cached_property
@@ -133,46 +157,100 @@ class NetworkTraining:
         """The compiled step."""
         return make_step(self.rate, self.descend, self.optimiser)
 
-    def initial(self) -> State:
-        """Return the state before the first step, with copies of the untrained weights."""
+    def initial(self, total: int) -> State:
+        """Return the state before the first of ``total`` steps, with copies of the weights."""
         weights = jax.tree.map(jnp.copy, self.network.weights)
-        return State(weights, self.optimiser.init(weights))
+        return State(weights, self.optimiser.init(weights), total)
 
-    def advance(self, state: State, total: int) -> State:
-        """Return the state after the next of ``total`` steps."""
-        done, of = jnp.asarray(state.done), jnp.asarray(total)
+    def advance(self, state: State) -> State:
+        """Return the state after the next step."""
+        done, of = jnp.asarray(state.done), jnp.asarray(state.total)
         weights, optimiser, loss = self.step(state.weights, state.optimiser, done, of)
-        return State(weights, optimiser, state.done + 1, loss)
+        return State(weights, optimiser, state.total, state.done + 1, loss)
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedTraining:
+    """The training of a network once its FEM runs are there.
+
+    plan : the plan, with as many simulations as were run.
+    emulator : the emulator whose network is untrained.
+    runs : the FEM solutions, or what sweeps give in their place, the one at the centre first.
+    training : the training of the network.
+    record : the entries of the emulator's record.
+    """
+
+    plan: Any
+    emulator: Emulator
+    runs: Runs
+    training: NetworkTraining
+    record: dict[str, Any] = field(default_factory=dict)
+
+
+def train_network(prepared: PreparedTraining, job: Job, share: float) -> Emulator:
+    """Return the emulator whose network is trained, with its record.
+
+    share : the share of a budget after which the last step ends.
+    """
+    training, deadline = prepared.training, job.deadline(share)
+    limit = StepLimit(deadline) if np.isfinite(deadline) else None
+    state = run(
+        job.checkpoint("steps"),
+        training.initial(prepared.plan.steps),
+        training.advance,
+        limit,
+        report=training.report,
+        progress=job.progress,
+    )
+    weights = training.finish(state.weights, job.progress)
+    emulator = with_weights(prepared.emulator, weights)
+    plan: Plan = replace(prepared.plan, steps=state.done)
+    cached = emulator.cache()
+    distance = distance_from_equilibrium(
+        job.simulator, lambda x: cached(job.scene.from_unit(x)), plan.seed
+    )
+    record = {**plan.record(state.loss), **prepared.record, "equilibrium": distance}
+    return replace(emulator, record=record)
+
+
+def with_weights(emulator: Emulator, weights: Any) -> Emulator:
+    """Return ``emulator`` with other weights of its network."""
+    assert emulator.network is not None, "only a network has weights"
+    return replace(emulator, network=replace(emulator.network, weights=weights))
 
 
 def run(
-    session: Session,
+    checkpoint: Checkpoint,
     state: State,
-    total: int,
-    advance: Advance,
+    advance: Callable[[State], State],
     limit: StepLimit | None = None,
     *,
+    report: Callable[[float], str] = "loss {:.3e}".format,
     progress: bool,
 ) -> State:
-    """Return the state after all steps, from ``state`` or the checkpoint, and write checkpoints.
-
-    They are written as often as the plan says, and after the last step.
+    """Return the state after all steps, from ``state`` or the checkpoint.
 
     Raises :class:`SolverError`: the last loss is not finite.
     """
-    state, every = session.first(state, total), session.plan.checkpoint_every
-    with counting(desc="train", initial=state.done, total=total, disable=not progress) as bar:
-        while state.done < total:
-            state = advance(state, total)
-            bar.total = total = total if limit is None else limit(state, total)
+    if (kept := checkpoint.restore(lambda: state)) is not None:
+        weights, optimiser = jax.tree.map(jnp.asarray, (kept.weights, kept.optimiser))
+        state = kept._replace(weights=weights, optimiser=optimiser)
+    with counting(
+        desc="steps of the network", initial=state.done, total=state.total, disable=not progress
+    ) as bar:
+        while state.done < state.total:
+            state = advance(state)
+            if limit is not None:
+                state = state._replace(total=limit(state))
+            bar.total = state.total
             bar.update()
             if state.done % _SHOW_EVERY == 0:
-                bar.set_postfix(loss=f"{float(state.loss):.3e}")
-            if state.done % every == 0 or state.done == total:
-                session.write(state, total)
+                bar.set_postfix_str(report(float(state.loss)))
+            checkpoint.keep(lambda: state)  # noqa: B023
     state = state._replace(loss=float(state.loss))
     if not np.isfinite(state.loss):
         raise SolverError("training ended in a loss that is not finite; lower the learning rate")
+    checkpoint.write(lambda: state)
     return state
 
 
@@ -187,24 +265,20 @@ class StepLimit:
 
     def __init__(self, deadline: float) -> None:
         self._deadline = deadline
-        self._began, self._first = time.perf_counter(), 0
+        self._began, self._first = 0.0, -1
 
-    def __call__(self, state: State, total: int) -> int:
+    def __call__(self, state: State) -> int:
         """Return the number of steps that follows from the time the last ones took.
 
-        :class:`InputError` where fewer steps fit than a warm-up takes.
+        It is a warm-up's at least: fewer would leave a network that knows nothing.
         """
-        if state.done == 1:  # the first step compiles: the clock starts after it
+        steps = state.done - self._first
+        if self._first < 0:  # the first step compiles: the clock starts after it
             jax.block_until_ready(state.loss)
             self._began, self._first = time.perf_counter(), state.done
-        elif state.done == WARMUP // 10 or state.done % _AIM_EVERY == 0:
+        elif steps == WARMUP // 10 or steps % _AIM_EVERY == 0:
             jax.block_until_ready(state.loss)
             now = time.perf_counter()
-            one = (now - self._began) / (state.done - self._first)
-            total = state.done + max(int((self._deadline - now) / one), 0)
-            if total < WARMUP:
-                raise InputError(
-                    f"the budget leaves {total} training steps of {1e3 * one:.0f} ms after FEM "
-                    f"runs and compilation; give at least {(WARMUP - total) * one:.0f} s more"
-                )
-        return total
+            one = (now - self._began) / steps
+            return max(state.done + max(int((self._deadline - now) / one), 0), WARMUP)
+        return state.total

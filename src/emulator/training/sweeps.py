@@ -30,16 +30,15 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.core.checkpoint import Checkpoint
 from emulator.core.display import counting
 from emulator.core.errors import InputError, SolverError
-from emulator.core.store import inside, named_leaves, read_arrays, save_arrays
 from emulator.fem import Simulator
 from emulator.fem.campaign import Runs
 from emulator.fem.compiled import compiled
@@ -59,10 +58,10 @@ from emulator.surrogates.polynomial import (
     terms,
 )
 from emulator.surrogates.taylor import expand
-from emulator.training.checkpoint import SWEEPS, Record, Session
+from emulator.training.job import Job, Recipe
 from emulator.training.mechanics import anchored, family_on, of_position
-from emulator.training.plan import Job, Plan, check_order
-from emulator.training.targets import targets
+from emulator.training.plan import Plan, check_order
+from emulator.training.targets import Map, free_fields, targets
 from emulator.training.two_meshes import on_finer
 
 _LEVELS = 15  # least number of levels of the loads
@@ -76,10 +75,6 @@ _FEWEST = 32  # least number of theta in a sweep
 _TARGETS_PER_TERM = 3  # targets kept for each term of the next degree
 _CONVERGED = 1e-10  # relative error of the displacement at which the sweeps end
 _ROUNDED = 1e-2  # largest error of truncated modes, over the error bar
-_WRITE_EVERY = 30.0  # seconds
-
-Map = Callable[[jax.Array], jax.Array]
-"""A map from the position (p,) in the unit box to the displacement (n, 3) mm."""
 
 
 class SweepState(NamedTuple):
@@ -140,8 +135,9 @@ def sweep_box(
     *,
     starts: Sequence[Callable[[], Map]] = (),
     beneath: Map | None = None,
-    folder: Path | None = None,
+    checkpoint: Checkpoint = Checkpoint(),
     deadline: float = np.inf,
+    require_time: Callable[[str], None] = lambda _: None,
     progress: bool = False,
 ) -> SweepState:
     """Sweep over the box of a scene until the error bar is round-off.
@@ -153,20 +149,24 @@ def sweep_box(
         one before, because no tangent there is positive definite; after the last, and by default,
         sweeps begin at the body at rest.
     beneath : a map under the whole load to which the polynomial, at first zero, is added.
-    folder : the folder where the state is kept and taken up again.
+    checkpoint : the file where the state is kept and taken up again.
     deadline : the time, on the performance counter, after which no sweep begins, once the loads are
         at their whole level.
+    require_time : raises an error where there is no more time for the loads to rise.
     progress : whether a progress bar is shown.
 
     Raises :class:`SolverError`: equilibria were not followed up to the loads, or not over the whole
     box.
     """
-    state = _restore(folder) or _initial_state(simulator, starts, 0, beneath)
-    last_write = time.perf_counter()
+    state = checkpoint.restore(lambda: _at_rest(simulator))
+    if state is None:
+        state = _initial_state(simulator, starts, 0, beneath)
     with counting(desc="sweeps", initial=state.number, total=sweeps, disable=not progress) as bar:
         while state.number < sweeps and not state.done:
-            if time.perf_counter() > deadline and state.level == 1.0:
-                break
+            if time.perf_counter() > deadline:
+                if state.level == 1.0:
+                    break
+                require_time(f"{state.number} sweeps at {100 * state.level:.0f} % of the loads")
             state, display = _sweep(simulator, state, seed, beneath)
             if state.lost < len(starts) and state.level == 1.0 and not np.isfinite(state.error):
                 state = _initial_state(simulator, starts, state.lost + 1)._replace(
@@ -174,11 +174,8 @@ def sweep_box(
                 )
             bar.set_postfix(display)
             bar.update()
-            if folder is not None and time.perf_counter() - last_write > _WRITE_EVERY:
-                _write(folder, state)
-                last_write = time.perf_counter()
-    if folder is not None:
-        _write(folder, state)
+            checkpoint.keep(lambda: state)  # noqa: B023
+    checkpoint.write(lambda: state)
     if state.level < 1.0:
         cause = "no step could be taken from where the start says, and then " * bool(state.lost)
         failure = f"followed the equilibria to {100 * state.level:.0f} % of the loads"
@@ -237,7 +234,7 @@ def _initial_state(
         degree += 1
     position = np.random.default_rng(0).random((2 * terms(parameters, degree), parameters))
     try:
-        fields = _free_fields(simulator, starts[lost](), position)
+        fields = free_fields(simulator, starts[lost](), position)
     except SolverError:
         return _initial_state(simulator, starts, lost + 1)
     if not np.isfinite(fields).all():
@@ -245,12 +242,6 @@ def _initial_state(
     polynomial = fit(Samples(position, fields, np.zeros(len(position))), degree, 1.0)
     zeros = 0.0 * polynomial.coefficients
     return rest._replace(polynomial=polynomial, before=zeros, level=1.0)
-
-
-def _free_fields(simulator: Simulator, displacement: Map, position: np.ndarray) -> np.ndarray:
-    """Return the free displacements (c, f) mm of a map at ``position`` (c, p)."""
-    free = lambda x: simulator.system.restrict(displacement(x))  # noqa: E731
-    return np.asarray(jax.lax.map(free, jnp.asarray(position)))
 
 
 def _sweep(
@@ -265,8 +256,10 @@ def _sweep(
     rng = np.random.default_rng([seed, state.number])
     position = qmc.Sobol(parameters, rng=rng).random(count)
     level, extrapolation = _next_level(state) if state.rises else (state.level, state.polynomial)
-    below = 0.0 if beneath is None else _free_fields(simulator, beneath, position)
-    steps = targets(simulator, below + extrapolation.at(position), position, level)
+    below = 0.0 if beneath is None else free_fields(simulator, beneath, position)
+    steps = targets(
+        simulator, below + extrapolation.at(position), position, level, first=state.number == 0
+    )
     usable = np.isfinite(steps.error)
     usable_share = float(np.mean(usable & (steps.fraction >= _LEAST_FRACTION)))
     display = {"load": f"{level:.2f}", "taken": f"{usable_share:.2f}"}
@@ -338,19 +331,6 @@ def runs_of(simulator: Simulator, state: SweepState, thetas: jax.Array) -> Runs:
     return Runs(thetas, *compiled(lambda t: jax.lax.map(run_at, t))(thetas))
 
 
-def _write(folder: Path, state: SweepState) -> None:
-    save_arrays(folder / SWEEPS, named_leaves(state))
-
-
-def _restore(folder: Path | None) -> SweepState | None:
-    if folder is None or not (folder / SWEEPS).is_file():
-        return None
-    arrays, _ = read_arrays(folder / SWEEPS)
-    polynomial, values = inside(arrays, "polynomial"), inside(arrays, "values")
-    numbers = {name: arrays[name].item() for name in SweepState._field_defaults}
-    return SweepState(PolynomialFit(**polynomial), arrays["before"], Samples(**values), **numbers)
-
-
 @dataclass(frozen=True)
 class Sweeps(Plan):
     """A polynomial fitted by sweeps over the box.
@@ -368,46 +348,46 @@ class Sweeps(Plan):
         self.require_at_least(1, "sweeps")
         check_order(self.order)
 
-    def train(self, job: Job, session: Session) -> tuple[Emulator, Record]:
-        """Return the emulator and its record."""
-        scene, start = job.scene, job.start
-        check_sweeps(scene, self.sweeps, at_rest=not self.order and start is None)
-        simulator = Simulator(scene)
-        emulator = Emulator(scene)
-        starts: list[Callable[[], Map]] = []
-        beneath: Map | None = None
-        if start is not None and start.family is not None:
-            network = family_on(scene, start)
 
-            def at_the_centre() -> Map:
-                return of_position(anchored(network, expand(simulator, order=self.order or 1)))
+def train_sweeps(plan: Sweeps, job: Job) -> Emulator:
+    """Return the emulator and its record."""
+    scene, start, simulator = job.scene, job.start, job.simulator
+    check_sweeps(scene, plan.sweeps, at_rest=not plan.order and start is None)
+    emulator = Emulator(scene)
+    starts: list[Callable[[], Map]] = []
+    beneath: Map | None = None
+    if start is not None and start.family is not None:
+        network = family_on(scene, start)
 
-            starts = (
-                [at_the_centre] if self.order else [lambda: of_position(network), at_the_centre]
+        def at_the_centre() -> Map:
+            return of_position(anchored(network, expand(simulator, order=plan.order or 1)))
+
+        starts = [at_the_centre] if plan.order else [lambda: of_position(network), at_the_centre]
+    elif start is not None:
+        emulator = on_finer(start, scene, plan)
+        if plan.order:
+            raise InputError(
+                f"recipe '{plan.recipe}': an emulator on the coarser mesh to stand on, and a "
+                f"series of order {plan.order} to begin at; give one of them"
             )
-        elif start is not None:
-            emulator = on_finer(start, scene, self)
-            if self.order:
-                raise InputError(
-                    f"recipe '{self.recipe}': an emulator on the coarser mesh to stand on, and a "
-                    f"series of order {self.order} to begin at; give one of them"
-                )
-            beneath = of_position(emulator)
-        elif self.order:
-            starts = [lambda: expand(simulator, order=self.order)]
-        session.write_plan(self)
-        state = sweep_box(
-            simulator,
-            self.sweeps,
-            self.seed,
-            starts=starts,
-            beneath=beneath,
-            folder=job.folder,
-            deadline=job.deadline(0.99),
-            progress=job.progress,
-        )
-        plan = self.with_counts(sweeps=state.number)
-        session.write_plan(plan)
-        emulator = replace(emulator, polynomial=polynomial_part(simulator, state))
-        solved = int(state.lost > 0 or self.order > 0) if starts else 0
-        return emulator, {**plan.record(), "sweeps": state.record | {"fem_solutions": solved}}
+        beneath = of_position(emulator)
+    elif plan.order:
+        starts = [lambda: expand(simulator, order=plan.order)]
+    state = sweep_box(
+        simulator,
+        plan.sweeps,
+        plan.seed,
+        starts=starts,
+        beneath=beneath,
+        checkpoint=job.checkpoint("sweeps"),
+        deadline=job.deadline(0.99),
+        require_time=job.require_time,
+        progress=job.progress,
+    )
+    solved = int(state.lost > 0 or plan.order > 0) if starts else 0
+    record = replace(plan, sweeps=state.number).record()
+    record["sweeps"] = state.record | {"fem_solutions": solved}
+    return replace(emulator, polynomial=polynomial_part(simulator, state), record=record)
+
+
+SWEEPS = Recipe(Sweeps(), train_sweeps)

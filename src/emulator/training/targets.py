@@ -11,6 +11,7 @@ potential and inverts no element. There is no iteration at a theta, and no solut
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -25,11 +26,16 @@ from emulator.fem.linear import Outcome
 from emulator.fem.linear.reuse import conjugate_gradients
 from emulator.fem.newton import ARMIJO, armijo, backtrack
 
+Map = Callable[[jax.Array], jax.Array]
+"""A map from the position (p,) in the unit box to the displacement (n, 3) mm."""
+
 _GROUP = 8  # theta that share a factor
 _MIDDLES = 3  # members of a group whose tangents may be factorised, the middle first
 _STEPS, _TOLERANCE = 4, 1e-8  # steps and tolerance of conjugate gradients
 _LEAST_J = 0.05
 _LEAST_FRACTION = 2.0**-7
+_UNSEEN = 16  # theta at which a trained map is measured
+_CONTRACTION = 0.25  # largest ratio of residuals after and before a step that tells an error
 
 
 class Targets(NamedTuple):
@@ -59,16 +65,24 @@ class Targets(NamedTuple):
 
 
 def targets(
-    simulator: Simulator, fields: np.ndarray, position: np.ndarray, level: float
+    simulator: Simulator,
+    fields: np.ndarray,
+    position: np.ndarray,
+    level: float,
+    *,
+    group: int = _GROUP,
+    first: bool = True,
 ) -> Targets:
-    """Return the targets at ``position`` (c, p) in the unit box, c eight times a power of two.
+    """Return the targets at ``position`` (c, p) in the unit box.
 
     fields : the free displacements that the map predicts, (c, f) mm.
     level : the level of the loads and of moved supports.
+    group : the number of theta that share a factor; c is a power of two times as many.
+    first : whether the process has not compiled this before.
     """
     system, load = simulator.system, jnp.asarray(level)
     thetas = np.asarray(simulator.scene.from_unit(jnp.asarray(position)))
-    groups = _groups(position)
+    groups = _groups(position, group)
 
     def of_group(rows: np.ndarray) -> Targets:
         for middle in rows[:_MIDDLES]:
@@ -79,9 +93,37 @@ def targets(
         nothing = np.zeros(len(rows))
         return Targets(fields[rows], nothing + np.inf, nothing, nothing, nothing + np.inf)
 
-    results = in_order(of_group, iter(groups), at_once(simulator))
+    results = in_order(of_group, iter(groups), at_once(simulator), alone=int(first))
     back = np.argsort(np.concatenate(groups))
     return jax.tree.map(lambda *parts: np.concatenate(parts)[back], *results)
+
+
+def free_fields(simulator: Simulator, displacement: Map, position: np.ndarray) -> np.ndarray:
+    """Return the free displacements (c, f) mm of a map at ``position`` (c, p)."""
+    free = lambda x: simulator.system.restrict(displacement(x))  # noqa: E731
+    return np.asarray(jax.lax.map(free, jnp.asarray(position)))
+
+
+def distance_from_equilibrium(simulator: Simulator, displacement: Map, seed: int) -> dict[str, Any]:
+    r"""Return a record of a map's error at theta drawn anew, by Newton's step at each of them.
+
+    The step beside the tangent at the prediction is the error to first order, and the potential is
+    :math:`\tfrac12 r \cdot K^{-1} r` above its least value. Where a step is shortened, or leaves
+    more than a quarter of the residual, the error is not known.
+    """
+    from scipy.stats import qmc  # slow to import
+
+    rng = np.random.default_rng([seed, _UNSEEN])  # sweeps draw theirs from the seed and a number
+    position = qmc.Sobol(len(simulator.scene.parameters), rng=rng).random(_UNSEEN)
+    fields = free_fields(simulator, displacement, position)
+    steps = targets(simulator, fields, position, 1.0, group=1)
+    known = (steps.fraction == 1.0) & (steps.contraction <= _CONTRACTION)
+    record: dict[str, Any] = {"theta": _UNSEEN, "known": int(known.sum())}
+    if known.any():
+        errors, gaps = steps.step[known], 100.0 * steps.gap[known]
+        record["error_mm"] = {"median": float(np.median(errors)), "max": float(errors.max())}
+        record["energy_percent"] = {"median": float(np.median(gaps)), "max": float(gaps.max())}
+    return record
 
 
 def _displacement(system: System, v: jax.Array, theta: jax.Array, level: jax.Array) -> jax.Array:
@@ -89,10 +131,10 @@ def _displacement(system: System, v: jax.Array, theta: jax.Array, level: jax.Arr
     return system.scene.on_supports(system.extend(v), theta, level=level)
 
 
-def _groups(position: np.ndarray) -> list[np.ndarray]:
-    """Return the rows of ``position`` (c, p) in groups of eight, each from its middle on."""
+def _groups(position: np.ndarray, size: int) -> list[np.ndarray]:
+    """Return the rows of ``position`` (c, p) in groups of ``size``, each from its middle on."""
     parts = [np.arange(len(position))]
-    while len(parts[0]) > _GROUP:
+    while len(parts[0]) > size:
         halves = []
         for rows in parts:
             widest = np.argmax(np.ptp(position[rows], axis=0))

@@ -1,54 +1,57 @@
 """Recipe ``two_meshes``: an emulator on a coarser mesh of the same body, corrected by a few runs.
 
-The emulator on the coarser mesh is given as the start, or made by recipe ``mechanics`` and kept in
-the folder ``coarse`` beside the checkpoint. A discrepancy model of FEM runs on the scene's own mesh
-adds what the coarser mesh gets wrong.
+The emulator on the coarser mesh is given as the start, or made by recipe ``mechanics`` and kept
+with the checkpoint. A discrepancy model of FEM runs on the scene's own mesh adds what the coarser
+mesh gets wrong.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from emulator.catalogue import finer_of
 from emulator.core.errors import InputError
-from emulator.fem import Simulator
-from emulator.fem.campaign import Runs
 from emulator.scenes.scene import Scene
 from emulator.surrogates.coarse import carried
 from emulator.surrogates.emulator import Emulator, load, save_emulator
-from emulator.surrogates.taylor import Expansion
-from emulator.training.checkpoint import CHECKPOINT, Session, remove_checkpoint
-from emulator.training.mechanics import FEM_SHARE, DiscrepancyPlan, Mechanics, of_position
-from emulator.training.plan import Job, Plan
+from emulator.training.job import FEM_SHARE, Job, Recipe
+from emulator.training.mechanics import Mechanics, add_discrepancy, of_position, train_mechanics
+from emulator.training.plan import Plan, check_runs
 
 
 @dataclass(frozen=True)
-class TwoMeshes(DiscrepancyPlan):
-    """An emulator on a coarser mesh, and a discrepancy model."""
+class TwoMeshes(Plan):
+    """An emulator on a coarser mesh, and a discrepancy model.
+
+    simulations : the number of FEM runs on the scene's own mesh, with their sensitivities.
+    """
 
     recipe: str = "two_meshes"
     simulations: int = 10
 
-    def default_start(self, job: Job, *, resume: bool) -> Emulator:
-        """Return an emulator on the mesh that the scene's is finer than, kept beside the rest."""
-        assert job.folder is not None, "a training has one"
-        coarse, folder, plan = finer_of(job.scene).coarse, job.folder / "coarse", Mechanics()
-        if resume:
-            return load(folder, coarse)
-        session = Session(folder / CHECKPOINT, coarse.fingerprint, plan)
-        below = Job(coarse, progress=job.progress)
-        emulator = session.finished(*plan.train(below, session))
-        save_emulator(emulator, folder)
-        remove_checkpoint(folder)
-        return emulator
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_runs(self.simulations)
 
-    def prepare(self, job: Job) -> tuple[Emulator, Runs, Expansion | None]:
-        """Return the coarser mesh's emulator on this one, the FEM runs, and FEM's coarse series."""
-        emulator = on_finer(job.start, job.scene, self)
-        predictor, deadline = of_position(emulator), job.deadline(FEM_SHARE)
-        runs = job.fem_runs(Simulator(job.scene), self, predictor, deadline)
-        assert job.start is not None, "checked by on_finer"
-        return emulator, runs, job.start.taylor
+
+def train_two_meshes(plan: TwoMeshes, job: Job) -> Emulator:
+    """Return the emulator and its record."""
+    start = job.start or _coarse_emulator(job)
+    emulator = on_finer(start, job.scene, plan)
+    runs = job.fem_runs(plan, of_position(emulator), job.deadline(FEM_SHARE))
+    plan = replace(plan, simulations=len(runs.theta) - 1)
+    emulator, choice = add_discrepancy(emulator, runs, start.taylor)
+    return replace(emulator, record={**plan.record(), "discrepancy": choice})
+
+
+def _coarse_emulator(job: Job) -> Emulator:
+    """Return an emulator on the mesh that the scene's is finer than, kept with the checkpoint."""
+    assert job.folder is not None, "a training has one"
+    coarse, folder = finer_of(job.scene).coarse, job.folder / "coarse"
+    if not (folder / "emulator.json").is_file():
+        emulator = train_mechanics(Mechanics(), Job(coarse, progress=job.progress))
+        save_emulator(emulator, folder)
+    return load(folder, coarse)
 
 
 def on_finer(start: Emulator | None, scene: Scene, plan: Plan) -> Emulator:
@@ -69,3 +72,6 @@ def on_finer(start: Emulator | None, scene: Scene, plan: Plan) -> Emulator:
             f"expected one of the mesh that finer:{scene.name} refines"
         )
     return Emulator(scene, coarse=carried(start.parts, body))
+
+
+TWO_MESHES = Recipe(TwoMeshes(), train_two_meshes)

@@ -9,7 +9,7 @@ from calibrate.cli import main
 from calibrate.cli.run_words import sampler_options
 from calibrate.posterior import read_tree
 from calibrate.project.results import SAMPLING
-from calibrate.samplers.checkpoint import Checkpoint
+from emulator.core.checkpoint import Checkpoint
 
 
 class Killed(Exception):

@@ -8,7 +8,7 @@ import pytest
 
 import calibrate as cal
 from calibrate.samplers import SAMPLERS, options_from
-from calibrate.samplers.checkpoint import Checkpoint
+from emulator.core.checkpoint import Checkpoint
 from emulator.core.errors import InputError
 from linear_support import linear_problem
 

@@ -27,8 +27,8 @@ def lines(clock, each, count, **options):
 def test_a_line_every_ten_seconds_and_one_at_the_end(clock):
     said = lines(clock, 4.0, 8)
     assert said == [
-        "FEM: 3 of 8 runs, 12 s",
-        "FEM: 6 of 8 runs, 24 s",
+        "FEM: 3 of 8 runs, 12 s, 20 s left",
+        "FEM: 6 of 8 runs, 24 s, 8 s left",
         "FEM: 8 of 8 runs, 32 s",
     ]
 

@@ -206,5 +206,7 @@ def test_an_untrained_network_adds_nothing_to_its_series(beam, simulator):
 def test_an_unknown_decoder_or_edge_sum():
     with pytest.raises(em.InputError, match="decoder 'dense': use pointwise or separable"):
         Architecture(decoder="dense")
-    with pytest.raises(em.InputError, match="edge sum 'all': use antisymmetric or receives"):
+    with pytest.raises(em.InputError, match="edge_sum 'all': use antisymmetric or receives"):
         Architecture(edge_sum="all")
+    with pytest.raises(em.InputError, match="branch_activation 'step': use celu or swish"):
+        Architecture(branch_activation="step")

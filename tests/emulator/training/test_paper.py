@@ -13,9 +13,9 @@ from emulator.fem.campaign.designs import uniform
 from emulator.geometry.refinement import to_quadratic
 from emulator.surrogates import Architecture
 from emulator.training import recipe, train
-from emulator.training.network_plan import with_weights
-from emulator.training.paper import Paper
-from emulator.training.plan import Job
+from emulator.training.job import Job
+from emulator.training.optimiser import with_weights
+from emulator.training.paper import Paper, prepare
 
 SMALL = Architecture(steps=2, latent=8, hidden=(16, 16))
 
@@ -28,14 +28,14 @@ def test_the_recipe_is_the_papers():
 
 
 def test_rates_are_the_released_codes(beam):
-    rate = Paper().prepare(Job(beam, SMALL)).training.rate
+    rate = prepare(Paper(), Job(beam, SMALL)).training.rate
     rates = [float(rate(jnp.asarray(k), jnp.asarray(100))) for k in (0, 49, 50, 99)]
     assert rates == pytest.approx([1e-4, 1e-4, 1e-5, 1e-5])
 
 
 def test_a_step_descends_the_mean_energy(beam, simulator):
     """Its loss and its slope along a direction of all weights, by the scene's energy itself."""
-    problem = Paper(batch=4, seed=3).prepare(Job(beam, SMALL))
+    problem = prepare(Paper(batch=4, seed=3), Job(beam, SMALL))
     thetas = uniform(beam, 4, jax.random.fold_in(jax.random.key(3), 7))
     Pi = em.potential_energy(beam)
     centre = Pi(simulator(beam.centre), beam.centre)

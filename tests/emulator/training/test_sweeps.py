@@ -1,5 +1,8 @@
 """Equilibria over the whole box from residuals alone."""
 
+import subprocess
+import sys
+import time
 from dataclasses import replace
 
 import jax
@@ -9,19 +12,21 @@ import pytest
 
 import emulator as em
 from emulator.core.errors import InputError, SolverError
+from emulator.core.store import read_arrays
 from emulator.fem import simulator as fem_simulator
 from emulator.fem import sobol
 from emulator.surrogates import load, save_emulator
 from emulator.surrogates.network.pignn import Architecture
 from emulator.training import recipe, train
 from emulator.training import sweeps as module
-from emulator.training.checkpoint import CHECKPOINT, SWEEPS
 from emulator.training.sweeps import runs_of, sweep_box
 from emulator.training.targets import targets
 
 SMALL = Architecture(
     steps=2, latent=8, hidden=(16, 16), decoder="separable", modes=6, trunk=(16, 40)
 )
+
+PHYSICS = replace(recipe("physics"), sweeps=20, simulations=12, steps=20, polish=50)
 
 
 @pytest.fixture(scope="module")
@@ -205,8 +210,8 @@ def test_without_loads_nothing_moves(simulator):
 def test_a_box_that_is_known_in_part_is_refused(simulator, monkeypatch):
     """A fifth of the theta without a step: the others' error bar says nothing of those."""
 
-    def lame(*arguments):
-        found = targets(*arguments)
+    def lame(*arguments, **options):
+        found = targets(*arguments, **options)
         found.fraction[::5] = 0.0
         return found
 
@@ -235,33 +240,54 @@ def test_a_recipe_without_fem_and_without_a_network(beam, no_fem, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_network_that_never_saw_fem_killed_and_resumed(beam, no_fem, tmp_path, monkeypatch):
-    """The centre's solution of sweeps and the network; killed among sweeps, the same weights."""
-    plan = replace(
-        recipe("physics"), sweeps=20, simulations=12, steps=20, polish=50,
-        checkpoint_every=10,
-    )  # fmt: skip
-    whole = train(beam, plan, tmp_path / "whole", architecture=SMALL)
-    assert list(whole.parts) == ["taylor", "network"]
-    assert len(whole.taylor.indices) == 0
-    assert whole.record["plan"]["sweeps"] == whole.record["sweeps"]["number"] == 20
-    monkeypatch.setattr(module, "_WRITE_EVERY", 0.0)
-    keep = module._write
+def test_a_network_that_never_saw_fem(beam, no_fem, tmp_path):
+    """The centre's solution of sweeps and the network; it says how far from equilibrium it is."""
+    emulator = train(beam, PHYSICS, tmp_path, architecture=SMALL)
+    assert list(emulator.parts) == ["taylor", "network"]
+    assert len(emulator.taylor.indices) == 0
+    assert emulator.record["plan"]["sweeps"] == emulator.record["sweeps"]["number"] == 20
+    assert emulator.record["equilibrium"]["known"] == 16
 
-    def kill(folder, state):
-        keep(folder, state)
-        if state.number == 7:
-            raise KeyboardInterrupt
 
-    monkeypatch.setattr(module, "_write", kill)
-    killed = tmp_path / "killed"
-    with pytest.raises(KeyboardInterrupt):
-        train(beam, plan, killed, architecture=SMALL)
-    assert (killed / CHECKPOINT).is_file()
-    assert (killed / SWEEPS).is_file()
-    monkeypatch.setattr(module, "_write", keep)
-    resumed = train(beam, recipe("physics"), killed, architecture=SMALL, resume=True)
-    leaves = [jax.tree.leaves(e.network.weights) for e in (whole, resumed)]
+TRAINING = """
+import sys
+import emulator as em
+from emulator.surrogates.network.pignn import Architecture
+from emulator.training import job
+from emulator.training.physics import PhysicsPlan
+
+job._EVERY = 0.0  # a state after each sweep and each step
+em.train(
+    em.scenes.once_clamped_beam(cells=(4, 2, 2), order=1),
+    PhysicsPlan(sweeps=20, simulations=12, steps=300, polish=50),
+    sys.argv[1],
+    architecture=Architecture(2, 8, (16, 16), "separable", 6, trunk=(16, 40)),
+)
+"""
+
+
+@pytest.mark.slow
+def test_a_process_killed_twice_goes_on_to_the_same_weights(tmp_path):
+    """By SIGKILL, once among sweeps and once among steps of the network."""
+    scene = em.scenes.once_clamped_beam(cells=(4, 2, 2), order=1)
+    plan = replace(PHYSICS, steps=300)
+    whole = train(scene, plan, tmp_path / "whole", architecture=SMALL)
+    folder = tmp_path / "killed"
+
+    def killed_at(script, stage, name, count):
+        path, number = folder / "checkpoint" / f"{stage}.safetensors", 0
+        with subprocess.Popen([sys.executable, "-c", script, str(folder)]) as process:
+            while number < count:
+                assert process.poll() is None, "it ended before it was killed"
+                time.sleep(0.02)
+                number = int(read_arrays(path)[0][name]) if path.is_file() else 0
+            process.kill()
+
+    killed_at(TRAINING, "sweeps", "number", 7)
+    resumed = TRAINING.replace("sys.argv[1],", "sys.argv[1], resume=True,")
+    killed_at(resumed, "steps", "done", 40)
+    again = train(scene, recipe("physics"), folder, resume=True)
+    leaves = [jax.tree.leaves(e.network.weights) for e in (whole, again)]
     for a, b in zip(*leaves, strict=True):
         np.testing.assert_array_equal(a, b)
 

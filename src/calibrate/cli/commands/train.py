@@ -42,7 +42,8 @@ def _add_plan(parser: ArgumentParser) -> None:
     length.add_argument(
         "--budget",
         metavar="TIME",
-        help="time for everything, e.g. 10m (default 10m; without a network, all FEM runs)",
+        help="time for everything, e.g. 10m (default 10m; without a network, all FEM runs); with "
+        "--resume the time from now on",
     )
     length.add_argument("--steps", type=int, help="optimiser steps instead of a time")
 
@@ -91,19 +92,19 @@ def train(arguments: Namespace) -> Answer:
         from emulator.fem.campaign.store import read_runs
 
         campaign = read_runs(arguments.campaign, scene)
-        if "simulations" not in entries:
-            plan = plan.with_counts(simulations=len(campaign.runs.theta))
+        if "simulations" not in entries and plan.runs:
+            all_runs: dict[str, Any] = {"simulations": len(campaign.runs.theta)}
+            plan = replace(plan, **all_runs)
     # A plan without a network has nothing but FEM runs: all are solved unless --budget limits them.
-    runs_all = not plan.trains_network and arguments.budget is None
-    time = "10m" if arguments.budget is None else arguments.budget
-    ignores_budget = arguments.resume or "steps" in entries or runs_all
+    unlimited = arguments.resume or "steps" in entries or not plan.trains_network
+    budget = arguments.budget or (None if unlimited else "10m")
     result = train_emulator(
         scene,
         plan,
         arguments.out,
         start=start,
         campaign=campaign,
-        budget=None if ignores_budget else seconds(time),
+        budget=None if budget is None else seconds(budget),
         resume=arguments.resume,
         progress=not arguments.json,
     )
@@ -119,7 +120,7 @@ def train(arguments: Namespace) -> Answer:
     remove_checkpoint(arguments.out)
     runs = record["plan"].get("simulations", 0)
     text = _training_summary(arguments.out, scene.name, record)
-    if not ignores_budget and plan.runs > runs:
+    if budget is not None and not arguments.resume and plan.runs > runs:
         text += f"\n{runs} of {plan.runs} FEM runs fit into the budget: more time, smaller errors"
     text += f"\nwritten to {arguments.out}; next: calibrate infer {arguments.scene} "
     text += f"--emulator {arguments.out} --data measured.csv --out RUN"
@@ -165,6 +166,8 @@ def _training_summary(folder: str, scene: str, record: Mapping[str, Any]) -> str
     if "sweeps" in record and "steps" not in plan:
         usual, most = (record["sweeps"][name] for name in ("error_mm", "largest_error_mm"))
         text += f"; {usual:.1g} mm from equilibrium, {most:.1g} mm at the worst theta tried"
+    if "equilibrium" in record:
+        return f"{text}\n{_distance(record['equilibrium'])}"
     if error is None:
         return f"{text}; errors of forces, volumes and strains: calibrate evaluate {folder}"
     text += f"; {error:.2g} mm from FEM at held-out runs"
@@ -175,10 +178,27 @@ def _training_summary(folder: str, scene: str, record: Mapping[str, Any]) -> str
     return f"{text}, at worst {', '.join(worst)}" if worst else text
 
 
+def _distance(record: Mapping[str, Any]) -> str:
+    """Return a sentence on a network's error at theta that no training has seen."""
+    count, known = record["theta"], record["known"]
+    if not known:
+        return (
+            f"error: not known by Newton's step at any of {count} theta drawn anew, so far from "
+            "equilibrium is the network; give more time"
+        )
+    error, energy = record["error_mm"], record["energy_percent"]
+    text = (
+        f"error by Newton's step at {known} of {count} theta drawn anew: {error['median']:.2g} mm, "
+        f"{error['max']:.2g} mm at worst; potential energy {energy['median']:.1g} % above the least"
+    )
+    if known < count:
+        text += f"; not known at {count - known}, where it is larger: give more time"
+    return text
+
+
 def _plan_entries(arguments: Namespace) -> dict[str, Any]:
-    """Return the plan's fields from the command line; ``--resume`` allows none."""
-    names = (*_ENTRIES, "recipe", "budget")
-    options = [name for name in names if getattr(arguments, name) is not None]
+    """Return the plan's fields from the command line; ``--resume`` allows a budget only."""
+    options = [name for name in (*_ENTRIES, "recipe") if getattr(arguments, name) is not None]
     if arguments.resume and options:
         raise InputError(f"--{options[0]} has no effect with --resume: the checkpoint has its plan")
     return {name: getattr(arguments, name) for name in options if name in _ENTRIES}

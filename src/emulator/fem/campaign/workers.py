@@ -159,15 +159,17 @@ def at_once(simulator: EquilibriumSolver, nodes: int | None = None) -> int:
     return max(1, int(min(cores(), _MEMORY_SHARE * memory() / bytes_per_solve)))
 
 
-def in_order[T, R](function: Callable[[T], R], tasks: Iterator[T], workers: int) -> Iterator[R]:
+def in_order[T, R](
+    function: Callable[[T], R], tasks: Iterator[T], workers: int, *, alone: int = 1
+) -> Iterator[R]:
     """Yield ``function`` of every task, in the order of the tasks, by ``workers`` threads.
 
-    The first task is done alone: the others use what it compiles. After it, a task is taken when
-    all but ``workers`` of the results before it have been yielded. So what a task is made of, such
-    as a start from earlier rows, does not depend on which thread was quicker. While the threads
-    work, as many factors are kept as there are threads.
+    The first ``alone`` tasks come before the threads, which use what they compile. Then a task is
+    taken when all but ``workers`` of the results before it have been yielded. So what a task is
+    made of, such as a start from earlier rows, does not depend on which thread was quicker. While
+    the threads work, as many factors are kept as there are threads.
     """
-    for task in islice(tasks, 1):
+    for task in islice(tasks, alone):
         yield function(task)
     if workers == 1:
         yield from map(function, tasks)

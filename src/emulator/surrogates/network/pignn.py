@@ -19,7 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial, reduce
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, get_args, get_type_hints
 
 import jax
 import jax.numpy as jnp
@@ -42,6 +42,8 @@ class Architecture:
         over the edges it ``receives``, as the released code has it.
     trunk, branch : the widths of the hidden layers below the learned modes and below the
         coefficients of a separable decoder; ``hidden`` where empty.
+    branch_activation : the function between the branch's layers; swish is smooth, CELU's second
+        derivative, between all other layers, jumps.
     """
 
     steps: int = 5
@@ -52,20 +54,20 @@ class Architecture:
     edge_sum: Literal["antisymmetric", "receives"] = "antisymmetric"
     trunk: tuple[int, ...] = ()
     branch: tuple[int, ...] = ()
+    branch_activation: Literal["celu", "swish"] = "celu"
 
     def __post_init__(self) -> None:
-        if self.decoder not in ("pointwise", "separable"):
-            raise InputError(f"decoder '{self.decoder}': use pointwise or separable")
-        if self.edge_sum not in ("antisymmetric", "receives"):
-            raise InputError(f"edge sum '{self.edge_sum}': use antisymmetric or receives")
+        for name in ("decoder", "edge_sum", "branch_activation"):
+            kinds, value = get_args(get_type_hints(Architecture)[name]), getattr(self, name)
+            if value not in kinds:
+                raise InputError(f"{name} '{value}': use {' or '.join(kinds)}")
 
 
 class MLP(nnx.Module):
-    """Dense layers with CELU between them, on an input concatenated from several parts.
+    """Dense layers with an activation between them, on an input concatenated from several parts.
 
-    The first layer is linear in each part, ``[a, b] @ W = a @ W_a + b @ W_b``, so a part shared by
-    many rows (theta by all nodes, a node by all its edges) is multiplied once and the product
-    copied: :meth:`project` each part, add, then :meth:`finish`.
+    The first layer is linear in each part, ``[a, b] @ W = a @ W_a + b @ W_b``, so a part that many
+    rows share is multiplied once: :meth:`project` each part, add, then :meth:`finish`.
 
     Parameters
     ----------
@@ -74,6 +76,7 @@ class MLP(nnx.Module):
     out : the width of the output.
     layer_norm : whether to normalise the output (encoders and processor; not decoders).
     zero_last : whether the last layer starts at zero.
+    activation : the name of the activation in ``jax.nn``.
     """
 
     def __init__(
@@ -82,11 +85,12 @@ class MLP(nnx.Module):
         hidden: tuple[int, ...],
         out: int,
         *,
-        layer_norm: bool,
+        layer_norm: bool = False,
         zero_last: bool = False,
+        activation: str = "celu",
         rngs: nnx.Rngs,
     ) -> None:
-        self.parts = parts
+        self.parts, self.activate = parts, getattr(jax.nn, activation)
         widths = (sum(parts), *hidden, out)
         linear = partial(nnx.Linear, param_dtype=jnp.float32, rngs=rngs)
         layers = [linear(a, b) for a, b in pairwise(widths)]
@@ -108,7 +112,7 @@ class MLP(nnx.Module):
 
     def hidden(self, *values: jax.Array) -> jax.Array:
         """Return the last hidden layer (..., hidden[-1]), from all parts."""
-        return jax.nn.celu(self._before(self._first(values), len(self.layers) - 1))
+        return self.activate(self._before(self._first(values), len(self.layers) - 1))
 
     def _first(self, values: tuple[jax.Array, ...]) -> jax.Array:
         return reduce(jnp.add, (self.project(k, v) for k, v in enumerate(values)))
@@ -118,7 +122,7 @@ class MLP(nnx.Module):
         bias = self.layers[0].bias
         x = first if bias is None else first + bias
         for layer in self.layers[1:stop]:
-            x = layer(jax.nn.celu(x))
+            x = layer(self.activate(x))
         return x
 
     def __call__(self, *values: jax.Array) -> jax.Array:
@@ -180,8 +184,7 @@ class Processor(nnx.Module):
         edges = self.encode_edge(jnp.asarray(graph.edge_features))
         for one_round in self.rounds:
             structure, weights = nnx.split(one_round)
-            # The backward pass computes the round again. Storing its values takes 79 MB for the
-            # beam, allocated anew at every step: 38.8 against 26.5 ms for the gradient on 2 cores.
+            # Computed again backward: 26.5 ms on the beam; storing its 79 MB takes 38.8.
             nodes, edges = jax.checkpoint(
                 lambda w, v, e, structure=structure: nnx.merge(structure, w)(v, e, graph)
             )(weights, nodes, edges)
@@ -198,7 +201,7 @@ class PointwiseDecoder(nnx.Module):
     def __init__(self, architecture: Architecture, parameters: int, rngs: nnx.Rngs) -> None:
         M, hidden = architecture.latent, architecture.hidden
         self.encode_theta = MLP((parameters,), hidden, M, layer_norm=True, rngs=rngs)
-        component = partial(MLP, (M, 2 * M), hidden, 1, layer_norm=False, zero_last=True, rngs=rngs)
+        component = partial(MLP, (M, 2 * M), hidden, 1, zero_last=True, rngs=rngs)
         self.components = nnx.List([component() for _ in range(3)])
 
     def prepare(self, states: jax.Array) -> jax.Array:
@@ -218,7 +221,8 @@ class PointwiseDecoder(nnx.Module):
 def branch(parts: tuple[int, ...], out: int, architecture: Architecture, rngs: nnx.Rngs) -> MLP:
     """Return the network of the coefficients, zero before training."""
     widths = architecture.branch or architecture.hidden
-    return MLP(parts, widths, out, layer_norm=False, zero_last=True, rngs=rngs)
+    kind = architecture.branch_activation
+    return MLP(parts, widths, out, zero_last=True, activation=kind, rngs=rngs)
 
 
 def trunk(
@@ -229,7 +233,7 @@ def trunk(
     parts : the widths of its inputs, where it has others than the state.
     """
     widths, out = architecture.trunk or architecture.hidden, vectors * architecture.modes
-    return MLP(parts or (2 * architecture.latent,), widths, out, layer_norm=False, rngs=rngs)
+    return MLP(parts or (2 * architecture.latent,), widths, out, rngs=rngs)
 
 
 class SeparableDecoder(nnx.Module):
@@ -258,11 +262,7 @@ Decoder = PointwiseDecoder | SeparableDecoder
 
 
 class PIGNN(nnx.Module):
-    """Processor and decoder of one scene, with weights from a seed.
-
-    graph : the graph, of which only the widths of features matter.
-    parameters : the number of entries of theta.
-    """
+    """Processor and decoder of one scene, with weights from a seed; of ``graph`` widths matter."""
 
     def __init__(
         self,

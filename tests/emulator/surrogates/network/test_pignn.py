@@ -28,15 +28,22 @@ def test_the_published_sizes_have_the_published_number_of_weights():
     assert count == pytest.approx(510_000, rel=0.005)
 
 
-def test_an_mlp_of_parts_is_the_mlp_of_their_concatenation():
-    mlp = MLP((3, 5), (7, 6), 4, layer_norm=True, rngs=nnx.Rngs(0))
+ACTIVATIONS = {
+    "celu": lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0))),  # alpha is 1
+    "swish": lambda x: x / (1.0 + np.exp(-x)),
+}
+
+
+@pytest.mark.parametrize("name", ACTIVATIONS)
+def test_an_mlp_of_parts_is_the_mlp_of_their_concatenation(name):
+    mlp = MLP((3, 5), (7, 6), 4, layer_norm=True, activation=name, rngs=nnx.Rngs(0))
     rng = np.random.default_rng(0)
     a, b = (jnp.asarray(rng.normal(size=(10, width)), jnp.float32) for width in (3, 5))
     x = np.hstack([a, b])
     for k, layer in enumerate(mlp.layers):
         x = x @ np.asarray(layer.kernel[...]) + np.asarray(layer.bias[...])
         if k < 2:
-            x = np.where(x > 0, x, np.expm1(np.minimum(x, 0)))  # CELU with alpha 1
+            x = ACTIVATIONS[name](x)
     x = (x - x.mean(axis=1, keepdims=True)) / np.sqrt(x.var(axis=1, keepdims=True) + 1e-6)
     np.testing.assert_allclose(mlp(a, b), x, atol=1e-5)
 

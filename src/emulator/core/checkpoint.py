@@ -1,8 +1,8 @@
-"""A run's state on disk, from which a killed run continues.
+"""A run's state on disk, from which a killed run continues: of samplers and of trainings.
 
 A state is a pytree of arrays. It is written every few seconds, whole or not at all, together with
-the run's identity: model, data, options and seed. The state does not depend on the clock, so a
-resumed run gives the draws of an uninterrupted one, bit for bit.
+the run's identity: all that the state depends on, such as data, options and seed. The state does
+not depend on the clock, so a resumed run gives the result of an uninterrupted one, bit for bit.
 """
 
 from __future__ import annotations
@@ -31,19 +31,21 @@ class Checkpoint:
     Parameters
     ----------
     path : a safetensors file; ``None`` for no checkpoint.
-    identity : the values by name that the run depends on; a file with others is refused.
+    identity : the JSON values by name that the run depends on; a file with others is refused.
     every : the seconds between two writes.
+    after : called after each write.
     """
 
     def __init__(
         self,
         path: str | Path | None = None,
-        identity: Mapping[str, str] = {},
+        identity: Mapping[str, Any] = {},
         every: float = 10.0,
+        after: Callable[[], None] = lambda: None,
     ) -> None:
         self.path = None if path is None else Path(path)
         self.identity = {"format": FORMAT, **identity}
-        self.every = every
+        self.every, self.after = every, after
         self._written = time.monotonic()
 
     def restore(self, template: Callable[[], Any]) -> Any | None:
@@ -51,8 +53,8 @@ class Checkpoint:
 
         Parameters
         ----------
-        template : () -> a pytree of the state's structure; its leaves have ``dtype``. Their shapes
-            may differ from those in the file, because the number of draws grows.
+        template : () -> a pytree of the state's structure; its leaves have ``dtype``, or are
+            numbers. Their shapes may differ from those in the file: the number of draws grows.
 
         Raises
         ------
@@ -67,15 +69,17 @@ class Checkpoint:
         named = named_leaves(tree)
         if named.keys() != arrays.keys():
             raise InputError(f"checkpoint {self.path} has other arrays than this run; remove it")
-        leaves = [
-            jax.random.wrap_key_data(jnp.asarray(arrays[n])) if _is_key(leaf) else arrays[n]
-            for n, leaf in named.items()
-        ]
+        leaves = [_as_in(leaf, arrays[name]) for name, leaf in named.items()]
         return jax.tree.unflatten(jax.tree.structure(tree), leaves)
 
     def keep(self, state: Callable[[], Any]) -> None:
         """Write ``state()``, if the last write is long enough ago."""
-        if self.path is None or time.monotonic() - self._written < self.every:
+        if time.monotonic() - self._written >= self.every:
+            self.write(state)
+
+    def write(self, state: Callable[[], Any]) -> None:
+        """Write ``state()``."""
+        if self.path is None:
             return
         arrays = {
             name: np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
@@ -83,6 +87,7 @@ class Checkpoint:
         }
         save_arrays(self.path, arrays, {"identity": json.dumps(self.identity)})
         self._written = time.monotonic()
+        self.after()
 
     def remove(self) -> None:
         """Delete the file, because its run is complete."""
@@ -111,6 +116,13 @@ def identity_of(
         digest.update(name.encode() + np.asarray(arrays[name]).tobytes())
     as_json = {name: json.dumps(value) for name, value in provenance.items()}
     return {**as_json, "data": digest.hexdigest()[:16]}
+
+
+def _as_in(leaf: Any, array: np.ndarray) -> Any:
+    """Return a leaf of a state from its array in the file; ``leaf`` is the template's."""
+    if _is_key(leaf):
+        return jax.random.wrap_key_data(jnp.asarray(array))
+    return array.item() if isinstance(leaf, int | float) else array
 
 
 def _is_key(leaf: Any) -> bool:
