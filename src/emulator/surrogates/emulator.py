@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, eye_array
 
 from emulator.catalogue import scene_from_origin
 from emulator.core.display import TableRepr
@@ -34,6 +34,7 @@ from emulator.core.errors import InputError, check_known, look_up
 from emulator.core.rooms import offered
 from emulator.core.store import inside, read_arrays, read_json, save_arrays, write_json
 from emulator.fem.reactions import SupportForce
+from emulator.geometry.facets import Cavity
 from emulator.scenes.scene import Scene, all_nodes, check_nodes, with_mesh
 from emulator.surrogates.coarse import Coarse
 from emulator.surrogates.discrepancy import Discrepancy
@@ -212,27 +213,49 @@ class CachedEmulator:
 
         None where the displacement is not a sum of modes.
         """
-        part, scene, rows = self.part, self.scene, csr_array(matrix)
-        if part.decode is not None:
+        if self.part.decode is not None:
             return None
-        held = scene.held[self.nodes].ravel()
-        free = csr_array(rows.multiply(~held[None]))
-        modes = free @ part.modes.reshape(-1, free.shape[1]).T
-        prescribed = {
-            name: rows @ np.where(held, displacement[self.nodes].ravel(), 0.0)
-            for name, displacement in scene.prescribed.per_unit.items()
-        }
-        fixed = rows @ np.where(held, scene.held_displacement[self.nodes].ravel(), 0.0)
-        offset = free @ part.offset.ravel() + fixed
+        offset, modes = self._modes_through(csr_array(matrix))
 
         def values(theta: jax.Array) -> tuple[jax.Array, jax.Array]:
-            inside = scene.space.contains(theta)
-            safe = jnp.where(inside, theta, scene.centre)
-            free_values = offset + modes @ self.coefficients(safe)
-            at = scene.resolve(safe)
-            return free_values + sum(at[name] * c for name, c in prescribed.items()), inside
+            return offset + modes @ self._amounts(theta), self.scene.space.contains(theta)
 
         return values
+
+    def volume(self, cavity: Cavity) -> Callable[[jax.Array], jax.Array] | None:
+        """Return the volume () in mL of ``cavity`` as a function of theta (p,), from coefficients.
+
+        Outside the box it is the volume at the centre. None where the displacement is not a sum of
+        modes, or of so many that their pairs outnumber the wall's displacements: the integral over
+        the wall is then less work.
+        """
+        wall, count = self.at(cavity.nodes), 3 * len(cavity.nodes)
+        if wall.part.decode is not None or 0.5 * len(wall.part.modes) ** 2 > count:
+            return None
+        offset, modes = wall._modes_through(csr_array(eye_array(count)))
+        of_amounts = cavity.of_modes(offset.reshape(-1, 3), modes.T.reshape(-1, count // 3, 3))
+        return lambda theta: of_amounts(wall._amounts(theta))
+
+    def _modes_through(self, matrix: csr_array) -> tuple[np.ndarray, np.ndarray]:
+        """Return an offset (r,) and modes (r, t): ``matrix @ u`` of :meth:`_amounts`."""
+        part, scene = self.part, self.scene
+        held = scene.held[self.nodes].ravel()
+        free = csr_array(matrix.multiply(~held[None]))
+        prescribed = [
+            matrix @ np.where(held, displacement[self.nodes].ravel(), 0.0)
+            for displacement in scene.prescribed.per_unit.values()
+        ]
+        fixed = matrix @ np.where(held, scene.held_displacement[self.nodes].ravel(), 0.0)
+        modes = free @ part.modes.reshape(-1, free.shape[1]).T
+        return free @ part.offset.ravel() + fixed, np.column_stack([modes, *prescribed])
+
+    def _amounts(self, theta: jax.Array) -> jax.Array:
+        """Return the coefficients (t,) of modes and of supports that move, inside the box."""
+        scene = self.scene
+        safe = jnp.where(scene.space.contains(theta), theta, scene.centre)
+        at = scene.resolve(safe)
+        moving = [at[name] for name in scene.prescribed.per_unit]
+        return jnp.concatenate([self.coefficients(safe), jnp.array(moving)])
 
     def support_force(self, force: SupportForce) -> Callable[[jax.Array], jax.Array] | None:
         """Return ``force`` in mN as a function of theta (p,), from the work of the whole body.
@@ -281,8 +304,11 @@ def _narrow(array: Any) -> np.ndarray:
 
 
 def shipped() -> list[str]:
-    """Return the names of the emulators that come with the package."""
-    return sorted(path.parent.name for path in SHIPPED.glob("*/emulator.json"))
+    """Return the names of the emulators that come with the package.
+
+    An installed package lacks the weights of the largest ones, which a clone has.
+    """
+    return sorted(path.parent.name for path in SHIPPED.glob("*/weights.safetensors"))
 
 
 KINDS = ("series", "physics")
@@ -310,12 +336,7 @@ def load(name: str | Path, scene: Scene | None = None, *, kind: str | None = Non
     if kind is not None:
         check_known(kind, KINDS, "kind")
         name = f"{name}_{kind}"
-    folder = SHIPPED / str(name) if str(name) in shipped() else Path(name)
-    if not (folder / "emulator.json").is_file():
-        raise InputError(
-            f"emulator '{name}' is neither shipped nor a folder with emulator.json; "
-            f"shipped: {', '.join(shipped()) or 'none'}"
-        )
+    folder = _folder_of(name)
     file, weights = folder / "emulator.json", folder / "weights.safetensors"
     description = read_json(file)
     try:
@@ -349,6 +370,25 @@ def load(name: str | Path, scene: Scene | None = None, *, kind: str | None = Non
     if other:
         parts["family"] = parts["family"].on(scene)
     return Emulator(scene, **parts, record=description.get("record", {}))
+
+
+def _folder_of(name: str | Path) -> Path:
+    """Return the folder of the emulator called ``name``, shipped or not."""
+    shipped_folder, folder = SHIPPED / name, Path(name)
+    if str(name) in shipped():
+        return shipped_folder
+    if (folder / "emulator.json").is_file():
+        return folder
+    if (shipped_folder / "emulator.json").is_file():
+        record = read_json(shipped_folder / "emulator.json")["record"]
+        raise InputError(
+            f"the installed package has no weights of '{name}'; make them here in about "
+            f"{record['seconds'] / 60.0:.0f} minutes: {record['command'][: -len('DIR')]}{name}"
+        )
+    raise InputError(
+        f"emulator '{name}' is neither shipped nor a folder with emulator.json; "
+        f"shipped: {', '.join(shipped()) or 'none'}"
+    )
 
 
 def _build(ingredients: Ingredients, _: Options) -> ForwardMap:
