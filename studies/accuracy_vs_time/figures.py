@@ -93,7 +93,8 @@ def draw_training(cases: list[Case], path: Path) -> None:
         2, (len(bodies) + 1) // 2, figsize=(8.6, 7.0), layout="constrained", squeeze=False
     )
     for axes, body in zip(panels.flat, bodies, strict=False):
-        shown = [case for case in cases if case["body"] == body and case["own_mm"]]
+        wide = [case for case in cases if not case["rung"].endswith("float32")]
+        shown = [case for case in wide if case["body"] == body and case["own_mm"]]
         mesh = next(case["truth_mm"]["median"] for case in shown if case["truth_mm"])
         axes.axhline(mesh, color="0.6", lw=1, ls="--", label="the mesh's error")
         for kind, (colour, mark) in STYLES.items():

@@ -24,6 +24,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cached_property
 from itertools import permutations
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -130,7 +131,7 @@ def enclosed_volume[A: (jax.Array, np.ndarray)](facets: np.ndarray) -> Callable[
 
 def _closed[A: (jax.Array, np.ndarray)](facets: np.ndarray) -> Callable[[A], A]:
     """Return ``x -> facets`` (..., k', 3 or 6, 3) mm: those of ``facets``, and lids on openings."""
-    fans = lids(facets)
+    fans: list[tuple[np.ndarray, Callable[[Any], Any]]] = lids(facets)
 
     def surface(x: A) -> A:
         parts = [x[..., facets, :], *(fan(x[..., nodes, :]) for nodes, fan in fans)]
