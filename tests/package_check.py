@@ -29,7 +29,7 @@ for package in (emulator, calibrate):
             assert error.name in ("plotly", "matplotlib", "jinja2", "markupsafe"), error
         except emulator.core.errors.InputError as error:  # of another extra, which it names
             assert "pip install 'soft-tissue-calibrate[" in str(error), error
-from emulator.surrogates.emulator import shipped
+from emulator.surrogates.folders import shipped
 for name in shipped():
     emulator.load(name)
 files = [getattr(module, "__file__", None) or "" for module in sys.modules.values()]

@@ -73,7 +73,7 @@ def test_a_wheel_stays_small_and_what_it_lacks_is_told_how_to_make(monkeypatch, 
             path = tmp_path / Path(file).relative_to("src/emulator/shipped")
             path.parent.mkdir(exist_ok=True)
             path.symlink_to(ROOT / file)
-    monkeypatch.setattr("emulator.surrogates.emulator.SHIPPED", tmp_path)
+    monkeypatch.setattr("emulator.surrogates.folders.SHIPPED", tmp_path)
     here = set(emulator.shipped())
     left_out = {path.name for path in tmp_path.iterdir()} - here
     assert len(left_out) == 5

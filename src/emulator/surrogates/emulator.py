@@ -38,6 +38,7 @@ from emulator.geometry.facets import Cavity
 from emulator.scenes.scene import Scene, all_nodes, check_nodes, with_mesh
 from emulator.surrogates.coarse import Coarse
 from emulator.surrogates.discrepancy import Discrepancy
+from emulator.surrogates.folders import KINDS, folder_of
 from emulator.surrogates.network import Network
 from emulator.surrogates.part import CachedPart, EmulatorPart, arrays_of, together
 from emulator.surrogates.polynomial import Polynomial
@@ -59,7 +60,6 @@ if TYPE_CHECKING:
 
 FORMAT = 3
 """The format of files: ``emulator.json`` describes, ``weights.safetensors`` has the arrays."""
-SHIPPED = Path(__file__).parent.parent / "shipped"
 
 PARTS: dict[str, type[EmulatorPart]] = {
     "coarse": Coarse,
@@ -303,28 +303,16 @@ def _narrow(array: Any) -> np.ndarray:
     return narrow if np.array_equal(narrow.astype(np.float64), wide) else wide
 
 
-def shipped() -> list[str]:
-    """Return the names of the emulators that come with the package.
-
-    An installed package lacks the weights of the largest ones, which a clone has.
-    """
-    return sorted(path.parent.name for path in SHIPPED.glob("*/weights.safetensors"))
-
-
-KINDS = ("series", "physics")
-"""Kinds of shipped emulators besides graph networks: Taylor series of FEM with what FEM runs taught
-beside it, and polynomials that no simulation taught."""
-
-
 def load(name: str | Path, scene: Scene | None = None, *, kind: str | None = None) -> Emulator:
     """Return the emulator in folder ``name``, or the shipped one of that name.
 
     Parameters
     ----------
-    name : one of :func:`shipped`, else a folder written by :func:`save_emulator`; write ``./name``
-        for a folder called like a shipped one. The graph network of a built-in scene has the
-        scene's name.
-    kind : one of :data:`KINDS`, for another shipped emulator of the scene called ``name``.
+    name : the name of a shipped emulator, else a folder written by :func:`save_emulator`; write
+        ``./name`` for a folder called like a shipped one. The graph network of a built-in scene has
+        the scene's name.
+    kind : ``series`` or ``physics``, for another shipped emulator of the scene called ``name``
+        (:mod:`emulator.surrogates.folders`).
     scene : the scene it must match; by default the one it was trained for is made again. A network
         that has learned a family of bodies, and stands alone, is taken to the scene's.
 
@@ -336,7 +324,7 @@ def load(name: str | Path, scene: Scene | None = None, *, kind: str | None = Non
     if kind is not None:
         check_known(kind, KINDS, "kind")
         name = f"{name}_{kind}"
-    folder = _folder_of(name)
+    folder = folder_of(name)
     file, weights = folder / "emulator.json", folder / "weights.safetensors"
     description = read_json(file)
     try:
@@ -370,25 +358,6 @@ def load(name: str | Path, scene: Scene | None = None, *, kind: str | None = Non
     if other:
         parts["family"] = parts["family"].on(scene)
     return Emulator(scene, **parts, record=description.get("record", {}))
-
-
-def _folder_of(name: str | Path) -> Path:
-    """Return the folder of the emulator called ``name``, shipped or not."""
-    shipped_folder, folder = SHIPPED / name, Path(name)
-    if str(name) in shipped():
-        return shipped_folder
-    if (folder / "emulator.json").is_file():
-        return folder
-    if (shipped_folder / "emulator.json").is_file():
-        record = read_json(shipped_folder / "emulator.json")["record"]
-        raise InputError(
-            f"the installed package has no weights of '{name}'; make them here in about "
-            f"{record['seconds'] / 60.0:.0f} minutes: {record['command'][: -len('DIR')]}{name}"
-        )
-    raise InputError(
-        f"emulator '{name}' is neither shipped nor a folder with emulator.json; "
-        f"shipped: {', '.join(shipped()) or 'none'}"
-    )
 
 
 def _build(ingredients: Ingredients, _: Options) -> ForwardMap:
