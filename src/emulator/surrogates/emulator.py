@@ -32,7 +32,7 @@ from emulator.catalogue import scene_from_origin
 from emulator.core.display import TableRepr
 from emulator.core.errors import InputError, check_known, look_up
 from emulator.core.rooms import offered
-from emulator.core.store import inside, read_arrays, read_json, save_arrays, write_json
+from emulator.core.store import inside, narrow, read_arrays, read_json, save_arrays, write_json
 from emulator.fem.reactions import SupportForce
 from emulator.geometry.facets import Cavity
 from emulator.scenes.scene import Scene, all_nodes, check_nodes, with_mesh
@@ -279,7 +279,7 @@ def save_emulator(emulator: Emulator, folder: str | Path) -> None:
     folder = Path(folder)
     if not emulator.parts:
         raise InputError("an emulator without any part has nothing to save")
-    arrays = {name: _narrow(array) for name, array in arrays_of(emulator.parts).items()}
+    arrays = {name: narrow(array) for name, array in arrays_of(emulator.parts).items()}
     digest = save_arrays(folder / "weights.safetensors", arrays)
     write_json(
         folder / "emulator.json",
@@ -292,15 +292,6 @@ def save_emulator(emulator: Emulator, folder: str | Path) -> None:
             "record": dict(emulator.record),
         },
     )
-
-
-def _narrow(array: Any) -> np.ndarray:
-    """Return the array in float32 where that loses nothing, which halves the file."""
-    wide = np.asarray(array)
-    if wide.dtype != np.float64 or np.abs(wide).max(initial=0.0) > np.finfo(np.float32).max:
-        return wide
-    narrow = wide.astype(np.float32)
-    return narrow if np.array_equal(narrow.astype(np.float64), wide) else wide
 
 
 def load(name: str | Path, scene: Scene | None = None, *, kind: str | None = None) -> Emulator:
