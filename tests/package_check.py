@@ -5,16 +5,19 @@ the extras, and used from another folder. The tests of the package itself then r
 unpacked sdist. Nothing may come from the checkout.
 """
 
+import fnmatch
 import os
 import subprocess
 import sys
 import tarfile
 import tempfile
+import tomllib
 import venv
 import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+LARGEST = 12e6  # bytes of a wheel
 IMPORTS = """
 import importlib, pkgutil, sys
 import calibrate, emulator
@@ -26,7 +29,7 @@ for package in (emulator, calibrate):
             assert error.name in ("plotly", "matplotlib", "jinja2", "markupsafe"), error
         except emulator.core.errors.InputError as error:  # of another extra, which it names
             assert "pip install 'soft-tissue-calibrate[" in str(error), error
-from emulator.surrogates.emulator import shipped
+from emulator.surrogates.folders import shipped
 for name in shipped():
     emulator.load(name)
 files = [getattr(module, "__file__", None) or "" for module in sys.modules.values()]
@@ -51,15 +54,30 @@ def main(dist: Path) -> None:
 
 
 def check_contents(wheel: Path, source: Path) -> None:
-    """All that is tracked is in the sdist, and all of ``src`` in the wheel."""
+    """All that is tracked is in the sdist, and all of ``src`` in the wheel but what is left out."""
     tracked = subprocess.check_output(["git", "ls-files"], cwd=ROOT, text=True).splitlines()
     private = (".ci/", ".pre-commit", ".python-version")
     absent = [f for f in tracked if not (source / f).is_file() and not f.startswith(private)]
     assert not absent, f"not in the sdist: {absent}"
     packed = set(zipfile.ZipFile(wheel).namelist())
-    absent = [f for f in tracked if f.startswith("src/") and f.removeprefix("src/") not in packed]
-    assert not absent, f"not in the wheel: {absent}"
-    print(f"sdist and wheel hold what they should, the wheel {len(packed)} files")
+    different = {f.removeprefix("src/") for f in in_wheel(tracked)} ^ {
+        f for f in packed if ".dist-info/" not in f
+    }
+    assert not different, f"in the wheel or the repository alone: {different}"
+    size = wheel.stat().st_size
+    assert size < LARGEST, f"the wheel has {size / 1e6:.1f} MB"
+    print(f"sdist and wheel hold what they should, the wheel {len(packed)} files, {size / 1e6} MB")
+
+
+def in_wheel(tracked: list[str]) -> list[str]:
+    """The files of ``src`` that a wheel holds: all but those that pyproject.toml leaves out."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    excluded = project["tool"]["hatch"]["build"]["targets"]["wheel"]["exclude"]
+    return [
+        file
+        for file in tracked
+        if file.startswith("src/") and not any(fnmatch.fnmatch(file, one) for one in excluded)
+    ]
 
 
 def environment(folder: Path, wheel: Path) -> Path:

@@ -21,7 +21,7 @@ from calibrate.measurements.data import read_measurements, write_data
 from calibrate.project import Run, make_data
 from cli_support import write_block
 from emulator.core.errors import InputError
-from emulator.surrogates.emulator import SHIPPED
+from emulator.surrogates.folders import SHIPPED
 from emulator.training import recipe
 from emulator.training.job import Job
 from emulator.training.paper import Paper

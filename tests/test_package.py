@@ -5,13 +5,16 @@ import shutil
 import subprocess
 import sys
 import tomllib
+import zlib
 from pathlib import Path
 
 import pytest
 
 import calibrate
 import emulator
+from calibrate.cli import build_parser
 from emulator.core.errors import InputError
+from package_check import in_wheel
 
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted((ROOT / "src").rglob("*.py"))
@@ -54,6 +57,36 @@ def test_what_the_readme_imports_is_there():
 )
 def test_in_a_fresh_process(code):
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_wheel_stays_small_and_what_it_lacks_is_told_how_to_make(monkeypatch, tmp_path):
+    """As deflated one by one, as zip does; ``make package`` measures the wheel itself."""
+    away, tmp_path = tmp_path / "away", tmp_path / "shipped"
+    away.mkdir()
+    tmp_path.mkdir()
+    files = [str(p.relative_to(ROOT)) for p in (ROOT / "src").rglob("*") if p.is_file()]
+    packed = in_wheel([file for file in files if "__pycache__" not in file])
+    sizes = [len(zlib.compress((ROOT / file).read_bytes())) for file in packed]
+    assert 5e6 < sum(sizes) < 11.5e6  # names and headers besides
+    for file in packed:
+        if "/shipped/" in file:
+            path = tmp_path / Path(file).relative_to("src/emulator/shipped")
+            path.parent.mkdir(exist_ok=True)
+            path.symlink_to(ROOT / file)
+    monkeypatch.setattr("emulator.surrogates.folders.SHIPPED", tmp_path)
+    here = set(emulator.shipped())
+    left_out = {path.name for path in tmp_path.iterdir()} - here
+    assert len(left_out) == 5
+    monkeypatch.chdir(away)
+    for name in left_out:
+        scene, kind = name.rsplit("_", 1)
+        with pytest.raises(InputError, match=f"no weights of '{name}'; make them here") as refused:
+            emulator.load(scene, kind=kind)
+        command = str(refused.value).partition(" minutes: calibrate ")[2].split()
+        parsed = build_parser().parse_args(command)
+        assert (parsed.scene, parsed.out) == (scene, name)
+    shutil.copytree(ROOT / "src/emulator/shipped/twisting_cube_physics", "twisting_cube_physics")
+    assert list(emulator.load("twisting_cube", kind="physics").parts) == ["polynomial"]
 
 
 def test_the_emulator_never_imports_calibrate():

@@ -7,7 +7,8 @@
 FEM, emulators, networks, reduced models and FEniCSx on the beam, the cube, the liver, the
 ventricle, a ventricle of 21 656 nodes and the released bodies: their error, their time, and what
 was done before. Then the posterior of the ventricle: its error against the time from mesh and data.
-Writes results.json, references/, pareto.png, released.png and posteriors.png beside itself.
+Writes results.json, references/, pareto.png, training.png, released.png and posteriors.png beside
+itself.
 
 ``--published DIR`` names the released data, ``--fenics PYTHON`` (or CALIBRATE_FENICS) an
 interpreter with FEniCSx; what needs them is skipped in one line without.
@@ -23,7 +24,7 @@ from typing import Any
 import numpy as np
 from studies.accuracy_vs_time import fenics, posteriors
 from studies.accuracy_vs_time.bodies import NAMES, find, is_released
-from studies.accuracy_vs_time.figures import draw, draw_posteriors, front
+from studies.accuracy_vs_time.figures import draw, draw_posteriors, draw_training, front
 from studies.accuracy_vs_time.measure import measure, references
 from studies.accuracy_vs_time.rungs import STAGES, Place
 from studies.common.output import Case, Results, parser
@@ -197,6 +198,9 @@ def tell(results: Results, out: Path) -> None:
         shown = [case for case in bodies if is_released(case["body"]) == of_release]
         if shown:
             draw(shown, out / path)
+    built_in = [case for case in bodies if not is_released(case["body"])]
+    if built_in:
+        draw_training(built_in, out / "training.png")
     if sampled:
         draw_posteriors(sampled, out / "posteriors.png")
 

@@ -16,6 +16,8 @@ import emulator as em
 from emulator.released.scenes import published_scene
 from emulator.scenes import Scene
 
+SERIES, NETWORK = "series as shipped", "graph network"
+
 
 @dataclass(frozen=True)
 class Body:
@@ -57,8 +59,8 @@ class Body:
 
 
 def of_scene(name: str) -> dict[str, str]:
-    """The emulator that is shipped of a scene, and its network."""
-    return {"emulator as shipped": f"{name}_series", "network alone": name}
+    """The series and the graph network that are shipped of a scene."""
+    return {SERIES: f"{name}_series", NETWORK: name}
 
 
 def linear(scene: Callable[..., Scene], *sizes: Any) -> Callable[[], Scene]:

@@ -20,6 +20,12 @@ STYLES = {
 }
 DECADE = 10.0
 LEAST = 1e-12  # mm; a smaller error is drawn here
+SOONEST = 1.0  # s; what needs nothing before is drawn here
+KINDS = {
+    "polished": "+ Newton steps",
+    "emulator": "series + discrepancy",
+    "network": "graph network",
+}
 LABELS = {"own_mm": "from FEM on the same mesh", "truth_mm": "from a much finer mesh"}
 
 
@@ -78,6 +84,47 @@ def _panel(axes: Any, cases: list[Case], key: str) -> None:
         axes.set_ylim(low / DECADE**0.5, high * DECADE**0.5)
     axes.grid(color="0.92")
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def draw_training(cases: list[Case], path: Path) -> None:
+    """Error on the mesh against what comes before the first value; a panel a body."""
+    bodies = list(dict.fromkeys(case["body"] for case in cases))
+    figure, panels = pyplot().subplots(
+        2, (len(bodies) + 1) // 2, figsize=(8.6, 7.0), layout="constrained", squeeze=False
+    )
+    for axes, body in zip(panels.flat, bodies, strict=False):
+        wide = [case for case in cases if not case["rung"].endswith("float32")]
+        shown = [case for case in wide if case["body"] == body and case["own_mm"]]
+        mesh = next(case["truth_mm"]["median"] for case in shown if case["truth_mm"])
+        axes.axhline(mesh, color="0.6", lw=1, ls="--", label="the mesh's error")
+        for kind, (colour, mark) in STYLES.items():
+            for runs in (True, False):
+                rows = [
+                    (max(case["offline_s"], SOONEST), max(case["own_mm"]["median"], LEAST))
+                    for case in shown
+                    if case["kind"] == kind and bool(case["fem_runs"]) == runs
+                ]
+                if rows:
+                    free = kind in ("network", "polished") and not runs
+                    label = f"{KINDS.get(kind, kind)}{', no simulation' if free else ''}"
+                    fill = colour if free else "none"
+                    axes.plot(*np.array(rows).T, mark, color=colour, mfc=fill, ls="", label=label)
+        axes.set(xscale="log", yscale="log", title=body, xlim=(0.6 * SOONEST, None))
+        axes.grid(color="0.92")
+        axes.spines[["top", "right"]].set_visible(False)
+    for axes in panels[-1]:
+        axes.set_xlabel(f"seconds before the first value (none: at {SOONEST:g})")
+    for axes in panels[:, 0]:
+        axes.set_ylabel("error on the same mesh (mm)")
+    legend = {
+        label: handle
+        for axes in panels.flat
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(
+        legend.values(), legend, loc="outside lower center", ncols=4, frameon=False, fontsize=9
+    )
+    save(figure, path, dpi=160)
 
 
 def draw_posteriors(cases: list[Case], path: Path) -> None:

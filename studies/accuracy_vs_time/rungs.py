@@ -13,7 +13,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from studies.accuracy_vs_time.bodies import Body
+from studies.accuracy_vs_time.bodies import NETWORK, Body
 from studies.common.maps import shipped
 from studies.common.timing import clocked
 from studies.common.two_meshes import on_two_meshes
@@ -32,7 +32,6 @@ from emulator.training import recipe, train
 
 POINTS, SEED = 24, 4
 FAST_CALLS = 60
-NETWORK = "network alone"
 COMPILED = 5000  # nodes below which Newton steps are compiled into one program with the map
 Solve = Callable[[jax.Array], jax.Array]
 CLOCK = process_time
@@ -138,12 +137,34 @@ def reduced(place: Place) -> Iterator[Rung]:
 
 
 def loaded(place: Place) -> Iterator[Rung]:
-    """What is shipped: the emulator, and the network alone."""
+    """What is shipped: the series; the graph network, cached and not, and one Newton step on it."""
     for label, name in place.body.shipped.items():
         made = shipped(name)
-        kind = "network" if label == NETWORK else "emulator"
         before = {"offline_s": made.seconds, "fem_runs": made.fem_runs}
+        kind = "network" if label == NETWORK else "emulator"
         yield of_map(label, kind, made.forward, place.at, **before)
+        if label == NETWORK:
+            uncached = em.load(name)
+            yield Rung(f"{label}, full field", kind, place.scene, made.forward, full=True, **before)
+            yield with_processor(f"{label}, processor in every call", uncached, place, before)
+            polished = corrected(made.forward, place.simulator, steps=1)
+            yield of_map(f"{label} + 1 Newton step", "polished", polished, place.at, **before)
+
+
+def with_processor(name: str, emulator: Emulator, place: Place, before: dict[str, Any]) -> Rung:
+    """A graph network without its cache; its weights are arguments, so that nothing is folded."""
+    nodes, network = landmarks(place.scene, place.at).nodes, emulator.network
+    assert network is not None
+
+    @jax.jit
+    def program(weights: Any, theta: jax.Array) -> jax.Array:
+        return replace(emulator, network=replace(network, weights=weights))(theta)[nodes]
+
+    def solve(theta: jax.Array) -> jax.Array:
+        return program(network.weights, theta)
+
+    calls = place.body.calls
+    return Rung(name, "network", place.scene, solve, compiled=False, calls=calls, **before)
 
 
 def carried(place: Place) -> Iterator[Rung]:

@@ -119,7 +119,7 @@ class Observation(ABC):
         """Return the data without noise, (*shape), as a function of theta (p,), or None.
 
         A function is returned where the map predicts this observation better than its displacement
-        does, which is only nearly in equilibrium.
+        does, which is only nearly in equilibrium, or with less work.
         """
         return None
 

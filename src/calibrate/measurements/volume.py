@@ -58,6 +58,11 @@ class CavityVolume(Scalar):
         """Return the volume (...) in mL."""
         return self.cavity(displacement)
 
+    def through(self, forward: ForwardMap) -> Callable[[jax.Array], jax.Array] | None:
+        """Return the volume () in mL from the coefficients of a map's modes, where that is less."""
+        from_modes = getattr(forward, "volume", None)
+        return None if from_modes is None else from_modes(self.cavity)
+
 
 class PressureVolume(NamedTuple):
     """A pressure-volume curve as a function of theta.

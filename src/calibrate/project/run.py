@@ -24,7 +24,7 @@ from emulator.core.errors import InputError
 from emulator.core.schema import read_json_as
 from emulator.scenes.finer import CHANGES
 from emulator.surrogates import registry, shipped
-from emulator.surrogates.emulator import KINDS
+from emulator.surrogates.folders import KINDS
 
 if TYPE_CHECKING:
     from calibrate.samplers import Sampler

@@ -217,3 +217,12 @@ def inside(arrays: Mapping[str, np.ndarray], folder: str) -> dict[str, np.ndarra
     """Return the arrays whose names begin with ``folder/``, keyed by the rest of the name."""
     start = f"{folder}/"
     return {name.removeprefix(start): a for name, a in arrays.items() if name.startswith(start)}
+
+
+def narrow(array: Any) -> np.ndarray:
+    """Return the array in float32 where that loses nothing, which halves the file."""
+    wide = np.asarray(array)
+    if wide.dtype != np.float64 or np.abs(wide).max(initial=0.0) > np.finfo(np.float32).max:
+        return wide
+    narrow = wide.astype(np.float32)
+    return narrow if np.array_equal(narrow.astype(np.float64), wide) else wide

@@ -23,6 +23,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
+from itertools import permutations
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -68,6 +70,22 @@ def cone_volume[A: (jax.Array, np.ndarray)](x: A) -> A:
     return height @ rule.weights / 3.0
 
 
+def cone_form(x: np.ndarray) -> np.ndarray:
+    """Return T (m, m, m) mm3, symmetric, with T y y y the :func:`cone_volume` of facets ``y @ x``.
+
+    x : fields of places (m, k, 3 or 6, 3) mm; the cones of all facets are added.
+    """
+    if x.shape[-2] == 3:
+        at, along, across = np.moveaxis(x, -2, 0) / 6.0 ** (1.0 / 3.0)
+    else:
+        rule = facet_rule(2, 4)
+        at = rule.weights[:, None] / 3.0 * (rule.values @ x)
+        along, across = np.moveaxis(np.einsum("qad,...ai->...qdi", rule.derivatives, x), -2, 0)
+    rows = at.reshape(len(x), -1).T
+    form = np.stack([np.cross(one, across).reshape(len(x), -1) @ rows for one in along])
+    return np.mean([form.transpose(order) for order in permutations(range(3))], axis=0)
+
+
 def mean_normal(corners: np.ndarray) -> np.ndarray:
     """Return the unit normal (3,) of all facets ``corners`` (k, 3 or 6, 3) together."""
     normal = cross_sides(corners).sum(axis=0)
@@ -104,18 +122,22 @@ def openings(facets: np.ndarray) -> list[np.ndarray]:
 def enclosed_volume[A: (jax.Array, np.ndarray)](facets: np.ndarray) -> Callable[[A], A]:
     """Return ``x -> V``, the volume (...) mm3 within ``facets`` (k, 3 or 6) and lids on openings.
 
-    It is positive where the facets' own normals point out of the enclosed space. The lid of an
-    opening is a fan from the mean of its rim's corners; ``x`` is (..., n, 3) in mm.
+    It is positive where the facets' own normals point out of the enclosed space. ``x`` is
+    (..., n, 3) in mm.
     """
-    rims = lids(facets)
+    surface = _closed(facets)
+    return lambda x: cone_volume(surface(x)).sum(-1)
 
-    def volume(x: A) -> A:
-        total = cone_volume(x[..., facets, :]).sum(-1)
-        for nodes, cone in rims:
-            total = total + cone(x[..., nodes, :])
-        return total
 
-    return volume
+def _closed[A: (jax.Array, np.ndarray)](facets: np.ndarray) -> Callable[[A], A]:
+    """Return ``x -> facets`` (..., k', 3 or 6, 3) mm: those of ``facets``, and lids on openings."""
+    fans: list[tuple[np.ndarray, Callable[[Any], Any]]] = lids(facets)
+
+    def surface(x: A) -> A:
+        parts = [x[..., facets, :], *(fan(x[..., nodes, :]) for nodes, fan in fans)]
+        return x.__array_namespace__().concatenate(parts, axis=-3)
+
+    return surface
 
 
 def lids[A: (jax.Array, np.ndarray)](
@@ -123,21 +145,17 @@ def lids[A: (jax.Array, np.ndarray)](
 ) -> list[tuple[np.ndarray, Callable[[A], A]]]:
     """Return the lid of each opening of ``facets`` (k, 3 or 6), facing as they do.
 
-    For each the nodes (r,) of the rim, and ``x -> V``, the signed volume (...) mm3 between the
-    origin and the lid at the rim's places x (..., r, 3) mm.
+    The lid is a fan from the mean of its rim's corners. For each the nodes (r,) of the rim, and the
+    function from their places (..., r, 3) mm to the fan's facets (..., e, 3 or 6, 3) mm.
     """
-    return [(np.unique(edges), _cone_over(edges)) for edges in openings(facets)]
+    return [(np.unique(edges), _fan_over(edges)) for edges in openings(facets)]
 
 
-def _cone_over[A: (jax.Array, np.ndarray)](edges: np.ndarray) -> Callable[[A], A]:
+def _fan_over[A: (jax.Array, np.ndarray)](edges: np.ndarray) -> Callable[[A], A]:
     nodes, rows = np.unique(edges, return_inverse=True)
     rows = rows.reshape(edges.shape)
     ends = np.searchsorted(nodes, np.unique(edges[:, :2]))
-
-    def volume(x: A) -> A:
-        return cone_volume(_lids(x[..., rows, :], x[..., ends, :].mean(-2))).sum(-1)
-
-    return volume
+    return lambda x: _lids(x[..., rows, :], x[..., ends, :].mean(-2))
 
 
 def _lids[A: (jax.Array, np.ndarray)](edges: A, middle: A) -> A:
@@ -178,8 +196,8 @@ class Cavity:
         self.nodes: np.ndarray = np.unique(facets)
         X = mesh.nodes[self.nodes]
         self._X = X - X.mean(axis=0)  # less cancellation: coordinates about the centroid
-        self._volume = enclosed_volume(np.searchsorted(self.nodes, facets))
-        signed = float(self._volume(self._X))
+        self._surface = _closed(np.searchsorted(self.nodes, facets))
+        signed = float(cone_volume(self._surface(self._X)).sum())
         if abs(signed) <= _FLAT * mesh.size**3:
             raise InputError(
                 f"facet set '{facet_set}' encloses no volume: it is flat, or has no inside"
@@ -191,12 +209,44 @@ class Cavity:
 
         Differentiable; ``displacement[..., cavity.nodes, :]`` restricts a full field.
         """
-        return self._factor * self._volume(self._X + jnp.asarray(displacement))
+        x = self._X + jnp.asarray(displacement)
+        return self._factor * cone_volume(self._surface(x)).sum(-1)
+
+    def of_modes(self, offset: np.ndarray, modes: np.ndarray) -> Callable[[jax.Array], jax.Array]:
+        r"""Return the volume () in mL as a function of the coefficients c (t,) of the wall's modes.
+
+        offset, modes : the displacement is ``offset + c @ modes``, (k, 3) and (t, k, 3) mm.
+
+        It is the integral over the wall to round-off: a cubic form of y = (1, c),
+
+        .. math:: V = \sum_{ijk} T_{ijk}\, y_i y_j y_k, \qquad
+            \frac{\partial V}{\partial y_k} = 3 \sum_{ij} T_{ijk}\, y_i y_j
+
+        with T symmetric, so that each pair ij stands once.
+        """
+        fields = np.concatenate([(self._X + offset)[None], modes])
+        first, second = np.triu_indices(len(fields))
+        twice = np.where(first == second, 1.0, 2.0)[:, None]
+        form = self._factor * twice * cone_form(self._surface(fields))[first, second]
+
+        def rate(y: jax.Array) -> jax.Array:
+            return (y[first] * y[second]) @ form
+
+        @jax.custom_jvp  # reverse mode would multiply by the form a second time
+        def volume(y: jax.Array) -> jax.Array:
+            return y @ rate(y)
+
+        @volume.defjvp
+        def slope(at: tuple[jax.Array], along: tuple[jax.Array]) -> tuple[jax.Array, jax.Array]:
+            (y,), (step,) = at, along
+            return y @ (third := rate(y)), 3.0 * (third @ step)
+
+        return lambda c: volume(jnp.concatenate([jnp.ones(1), c]))
 
     @cached_property
     def rest(self) -> float:
         """Volume of the undeformed cavity, mL."""
-        return self._factor * float(self._volume(self._X))
+        return self._factor * float(cone_volume(self._surface(self._X)).sum())
 
 
 def encloses(mesh: Mesh, facet_set: str) -> bool:

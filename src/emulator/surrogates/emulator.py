@@ -26,17 +26,19 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, eye_array
 
 from emulator.catalogue import scene_from_origin
 from emulator.core.display import TableRepr
 from emulator.core.errors import InputError, check_known, look_up
 from emulator.core.rooms import offered
-from emulator.core.store import inside, read_arrays, read_json, save_arrays, write_json
+from emulator.core.store import inside, narrow, read_arrays, read_json, save_arrays, write_json
 from emulator.fem.reactions import SupportForce
+from emulator.geometry.facets import Cavity
 from emulator.scenes.scene import Scene, all_nodes, check_nodes, with_mesh
 from emulator.surrogates.coarse import Coarse
 from emulator.surrogates.discrepancy import Discrepancy
+from emulator.surrogates.folders import KINDS, folder_of
 from emulator.surrogates.network import Network
 from emulator.surrogates.part import CachedPart, EmulatorPart, arrays_of, together
 from emulator.surrogates.polynomial import Polynomial
@@ -58,7 +60,6 @@ if TYPE_CHECKING:
 
 FORMAT = 3
 """The format of files: ``emulator.json`` describes, ``weights.safetensors`` has the arrays."""
-SHIPPED = Path(__file__).parent.parent / "shipped"
 
 PARTS: dict[str, type[EmulatorPart]] = {
     "coarse": Coarse,
@@ -212,27 +213,49 @@ class CachedEmulator:
 
         None where the displacement is not a sum of modes.
         """
-        part, scene, rows = self.part, self.scene, csr_array(matrix)
-        if part.decode is not None:
+        if self.part.decode is not None:
             return None
-        held = scene.held[self.nodes].ravel()
-        free = csr_array(rows.multiply(~held[None]))
-        modes = free @ part.modes.reshape(-1, free.shape[1]).T
-        prescribed = {
-            name: rows @ np.where(held, displacement[self.nodes].ravel(), 0.0)
-            for name, displacement in scene.prescribed.per_unit.items()
-        }
-        fixed = rows @ np.where(held, scene.held_displacement[self.nodes].ravel(), 0.0)
-        offset = free @ part.offset.ravel() + fixed
+        offset, modes = self._modes_through(csr_array(matrix))
 
         def values(theta: jax.Array) -> tuple[jax.Array, jax.Array]:
-            inside = scene.space.contains(theta)
-            safe = jnp.where(inside, theta, scene.centre)
-            free_values = offset + modes @ self.coefficients(safe)
-            at = scene.resolve(safe)
-            return free_values + sum(at[name] * c for name, c in prescribed.items()), inside
+            return offset + modes @ self._amounts(theta), self.scene.space.contains(theta)
 
         return values
+
+    def volume(self, cavity: Cavity) -> Callable[[jax.Array], jax.Array] | None:
+        """Return the volume () in mL of ``cavity`` as a function of theta (p,), from coefficients.
+
+        Outside the box it is the volume at the centre. None where the displacement is not a sum of
+        modes, or of so many that their pairs outnumber the wall's displacements: the integral over
+        the wall is then less work.
+        """
+        wall, count = self.at(cavity.nodes), 3 * len(cavity.nodes)
+        if wall.part.decode is not None or 0.5 * len(wall.part.modes) ** 2 > count:
+            return None
+        offset, modes = wall._modes_through(csr_array(eye_array(count)))
+        of_amounts = cavity.of_modes(offset.reshape(-1, 3), modes.T.reshape(-1, count // 3, 3))
+        return lambda theta: of_amounts(wall._amounts(theta))
+
+    def _modes_through(self, matrix: csr_array) -> tuple[np.ndarray, np.ndarray]:
+        """Return an offset (r,) and modes (r, t): ``matrix @ u`` of :meth:`_amounts`."""
+        part, scene = self.part, self.scene
+        held = scene.held[self.nodes].ravel()
+        free = csr_array(matrix.multiply(~held[None]))
+        prescribed = [
+            matrix @ np.where(held, displacement[self.nodes].ravel(), 0.0)
+            for displacement in scene.prescribed.per_unit.values()
+        ]
+        fixed = matrix @ np.where(held, scene.held_displacement[self.nodes].ravel(), 0.0)
+        modes = free @ part.modes.reshape(-1, free.shape[1]).T
+        return free @ part.offset.ravel() + fixed, np.column_stack([modes, *prescribed])
+
+    def _amounts(self, theta: jax.Array) -> jax.Array:
+        """Return the coefficients (t,) of modes and of supports that move, inside the box."""
+        scene = self.scene
+        safe = jnp.where(scene.space.contains(theta), theta, scene.centre)
+        at = scene.resolve(safe)
+        moving = [at[name] for name in scene.prescribed.per_unit]
+        return jnp.concatenate([self.coefficients(safe), jnp.array(moving)])
 
     def support_force(self, force: SupportForce) -> Callable[[jax.Array], jax.Array] | None:
         """Return ``force`` in mN as a function of theta (p,), from the work of the whole body.
@@ -256,7 +279,7 @@ def save_emulator(emulator: Emulator, folder: str | Path) -> None:
     folder = Path(folder)
     if not emulator.parts:
         raise InputError("an emulator without any part has nothing to save")
-    arrays = {name: _narrow(array) for name, array in arrays_of(emulator.parts).items()}
+    arrays = {name: narrow(array) for name, array in arrays_of(emulator.parts).items()}
     digest = save_arrays(folder / "weights.safetensors", arrays)
     write_json(
         folder / "emulator.json",
@@ -271,34 +294,16 @@ def save_emulator(emulator: Emulator, folder: str | Path) -> None:
     )
 
 
-def _narrow(array: Any) -> np.ndarray:
-    """Return the array in float32 where that loses nothing, which halves the file."""
-    wide = np.asarray(array)
-    if wide.dtype != np.float64 or np.abs(wide).max(initial=0.0) > np.finfo(np.float32).max:
-        return wide
-    narrow = wide.astype(np.float32)
-    return narrow if np.array_equal(narrow.astype(np.float64), wide) else wide
-
-
-def shipped() -> list[str]:
-    """Return the names of the emulators that come with the package."""
-    return sorted(path.parent.name for path in SHIPPED.glob("*/emulator.json"))
-
-
-KINDS = ("series", "physics")
-"""Kinds of shipped emulators besides graph networks: Taylor series of FEM with what FEM runs taught
-beside it, and polynomials that no simulation taught."""
-
-
 def load(name: str | Path, scene: Scene | None = None, *, kind: str | None = None) -> Emulator:
     """Return the emulator in folder ``name``, or the shipped one of that name.
 
     Parameters
     ----------
-    name : one of :func:`shipped`, else a folder written by :func:`save_emulator`; write ``./name``
-        for a folder called like a shipped one. The graph network of a built-in scene has the
-        scene's name.
-    kind : one of :data:`KINDS`, for another shipped emulator of the scene called ``name``.
+    name : the name of a shipped emulator, else a folder written by :func:`save_emulator`; write
+        ``./name`` for a folder called like a shipped one. The graph network of a built-in scene has
+        the scene's name.
+    kind : ``series`` or ``physics``, for another shipped emulator of the scene called ``name``
+        (:mod:`emulator.surrogates.folders`).
     scene : the scene it must match; by default the one it was trained for is made again. A network
         that has learned a family of bodies, and stands alone, is taken to the scene's.
 
@@ -310,12 +315,7 @@ def load(name: str | Path, scene: Scene | None = None, *, kind: str | None = Non
     if kind is not None:
         check_known(kind, KINDS, "kind")
         name = f"{name}_{kind}"
-    folder = SHIPPED / str(name) if str(name) in shipped() else Path(name)
-    if not (folder / "emulator.json").is_file():
-        raise InputError(
-            f"emulator '{name}' is neither shipped nor a folder with emulator.json; "
-            f"shipped: {', '.join(shipped()) or 'none'}"
-        )
+    folder = folder_of(name)
     file, weights = folder / "emulator.json", folder / "weights.safetensors"
     description = read_json(file)
     try:

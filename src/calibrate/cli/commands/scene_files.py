@@ -251,7 +251,7 @@ def scenes(arguments: Namespace) -> Answer:  # noqa: ARG001
     """List the built-in scenes and the emulators shipped for them."""
     from emulator.core.store import read_json
     from emulator.scenes import BUILT_IN
-    from emulator.surrogates.emulator import SHIPPED, shipped
+    from emulator.surrogates.folders import SHIPPED, shipped
 
     origins = {name: read_json(SHIPPED / name / "emulator.json")["scene"] for name in shipped()}
     rows: list[dict[str, Any]] = []
@@ -353,7 +353,7 @@ def completion(arguments: Namespace) -> Answer:
     from calibrate.cli import build_parser
     from emulator.mechanics.laws import LAWS
     from emulator.scenes import BUILT_IN
-    from emulator.surrogates.emulator import KINDS, shipped
+    from emulator.surrogates.folders import KINDS, shipped
 
     of_words = {
         "SCENE": _words([*BUILT_IN], "toml"),

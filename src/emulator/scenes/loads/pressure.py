@@ -236,12 +236,13 @@ class ValvePressure(FollowingPressure):
         """Return the potential of the pressure on each lid, one group of all nodes of its rim."""
         mesh = grid.mesh
         terms = []
-        for rim_nodes, cone in lids(mesh.facet_set(self.facet_set)):
+        for rim_nodes, fan in lids(mesh.facet_set(self.facet_set)):
 
             def energy(
-                u: jax.Array, at_rest: jax.Array, values: Values, cone: Callable = cone
+                u: jax.Array, at_rest: jax.Array, values: Values, fan: Callable = fan
             ) -> jax.Array:
-                return -self.value(values) * (cone(at_rest) - cone(at_rest + u))
+                cones = cone_volume(fan(at_rest)) - cone_volume(fan(at_rest + u))
+                return -self.value(values) * cones.sum()
 
             terms.append(LocalTerm(rim_nodes[None], mesh.nodes[rim_nodes][None], energy))
         return terms
