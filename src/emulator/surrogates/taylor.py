@@ -88,9 +88,9 @@ class Expansion(ArrayPart):
         known: Terms = {(): np.asarray(derivative(centre))}
         for degree in range(1, self.order + 1):
             derivative = jax.jacfwd(derivative)
-            tensor = np.asarray(jax.jit(derivative)(centre))
+            tensor = np.moveaxis(np.asarray(jax.jit(derivative)(centre)), 0, -1)
             for term in combinations_with_replacement(range(len(centre)), degree):
-                known[term] = tensor[(slice(None), *term)]
+                known[term] = tensor[term]
         modes = np.asarray(part.modes)
         fields = [
             np.tensordot(known[tuple(int(k) for k in row if k >= 0)], modes, axes=1)
