@@ -12,6 +12,9 @@ ROOT = Path(__file__).resolve().parents[1]
 # Read by JAX when it is imported, here and in the processes that tests start.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".pytest_cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+# Read by BLAS when it is loaded. Two workers whose small matrices have a thread a core each wait for
+# each other: the fit of a correction took 30 times the processor time.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax
 import pytest

@@ -75,6 +75,11 @@ def _library(values: Any) -> Any:
     return np if isinstance(values, np.ndarray) else jnp
 
 
+def _linalg(values: Any) -> Any:
+    # Not NumPy's: its BLAS has threads of its own, which would wait beside SciPy's.
+    return scipy.linalg if isinstance(values, np.ndarray) else jax.scipy.linalg
+
+
 CORRELATIONS: dict[str, Callable[[Any], Any]] = {
     "matern32": matern32,
     "squared_exponential": squared_exponential,
@@ -104,12 +109,11 @@ class Regression(NamedTuple):
     @classmethod
     def of(cls, covariance: Any) -> Regression:
         """Return the regression on observations of this covariance (n, n)."""
-        return cls(_library(covariance).linalg.cholesky(covariance))
+        return cls(_linalg(covariance).cholesky(covariance, lower=True))
 
     def weights(self, observations: Any) -> Any:
         """Return K^-1 y of observations y (n, ...); times k(x, X) they are the mean at x."""
-        linalg = scipy.linalg if isinstance(self.factor, np.ndarray) else jax.scipy.linalg
-        return linalg.cho_solve((self.factor, True), observations)
+        return _linalg(self.factor).cho_solve((self.factor, True), observations)
 
     def inverse(self) -> Any:
         """Return K^-1, (n, n)."""

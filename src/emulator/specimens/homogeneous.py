@@ -36,7 +36,7 @@ from emulator.core.small_newton import minimise_by_newton
 from emulator.fem.energy import point_energy
 from emulator.fem.material_point import stress_and_moduli
 from emulator.fem.solution import Solution, Status
-from emulator.mechanics.kinematics import cofactor, determinant
+from emulator.mechanics.kinematics import cofactor
 from emulator.scenes.scene import all_nodes, check_nodes
 from emulator.specimens.specimen import Specimen, require_specimen
 from emulator.surrogates.protocol import ForwardKind, Prediction, fingerprint_of
@@ -116,22 +116,21 @@ class Homogeneous:
         columns = jnp.swapaxes(settled, 1, 2)[of_node, self.nodes % 3]
         return Prediction(columns, jnp.all(converged))
 
-    def _free(self, rows: np.ndarray) -> tuple[jax.Array, jax.Array]:
+    def _free(self, rows: np.ndarray) -> tuple[jax.Array, jax.Array | None]:
         """Return the axes (e, u) of the free stretches, 3 for none, and that of the last, (e,).
 
-        The last one follows from the others where the specimen is incompressible, else it is 3.
+        The last one follows from the others where the specimen is incompressible, else it is None.
         It is one without a pull, if any free direction has none.
         """
         free, pulls = self.scene.states.free[rows], self.scene.states.pulls[rows]
         order = np.argsort(2 * ~free + 1 * (pulls == 0.0), axis=1, kind="stable")
         axes = np.where(np.take_along_axis(free, order, axis=1), order, 3)
         count = (axes < 3).sum(axis=1)
-        last = np.full(len(rows), 3)
-        if self.incompressible:
-            last = axes[np.arange(len(rows)), count - 1]
-            axes[np.arange(len(rows)), count - 1] = 3
-            count = count - 1
-        return jnp.asarray(axes[:, : count.max(initial=0)]), jnp.asarray(last)
+        if not self.incompressible:
+            return jnp.asarray(axes[:, : count.max(initial=0)]), None
+        last = jnp.asarray(axes[np.arange(len(rows)), count - 1])
+        axes[np.arange(len(rows)), count - 1] = 3
+        return jnp.asarray(axes[:, : (count - 1).max(initial=0)]), last
 
     def at(self, nodes: np.ndarray) -> Homogeneous:
         """Return the map restricted to ``nodes``: only their states are computed."""
@@ -217,7 +216,7 @@ def equilibrium(
     H: jax.Array,
     pulls: jax.Array,
     axes: jax.Array,
-    last: jax.Array,
+    last: jax.Array | None,
     tissue: Any,
 ) -> tuple[jax.Array, jax.Array]:
     """Return the displacement gradient (3, 3) of one state, and whether it is an equilibrium.
@@ -229,15 +228,18 @@ def equilibrium(
     H : the prescribed gradient (3, 3), zero in free directions.
     pulls : the first Piola-Kirchhoff stress along each axis in kPa, (3,).
     axes : the axes (u,) of the stretches that minimise the energy; 3 for none.
-    last : the axis of the stretch that keeps the volume; 3 for none.
+    last : the axis of the stretch that keeps the volume; None where it may change.
     """
-    dofs, closes = axes < 3, jnp.arange(3) == last
+    dofs = axes < 3
+    closes = jnp.zeros(3, dtype=bool) if last is None else jnp.arange(3) == last
 
     def gradient(d: jax.Array) -> jax.Array:
         stretched = H.at[axes, axes].set(d, mode="drop")
+        if last is None:
+            return stretched
         F = stretched + jnp.diag(jnp.where(closes, 0.0, 1.0))  # its last stretch is zero
-        along = jnp.where(closes, jnp.diagonal(cofactor(F)), 1.0)
-        closing = (1.0 - determinant(F)) / along - 1.0
+        along = cofactor(F)[last]
+        closing = (1.0 - jnp.vdot(F[last], along)) / along[last] - 1.0
         return stretched + jnp.diag(jnp.where(closes, closing, 0.0))
 
     free = closes.at[axes].set(True, mode="drop")
@@ -256,9 +258,10 @@ def equilibrium(
         H = gradient(d)
         stress, moduli = point.moduli(H, tissue)
         stress = stress - jnp.diag(pulls)
-        along, bending = slope_of(d), jax.jacfwd(slope_of)(d)
+        along = slope_of(d)
         stiffness = jnp.einsum("ija,ijkl,klb->ab", along, moduli, along)
-        stiffness += jnp.einsum("ij,ijab->ab", stress, bending)
+        if last is not None:  # the stretch that keeps the volume is no linear function of d
+            stiffness += jnp.einsum("ij,ijab->ab", stress, jax.jacfwd(slope_of)(d))
         stiffness = jnp.where(dofs[:, None] & dofs, stiffness, jnp.diag(jnp.where(dofs, 0.0, 1.0)))
         slope = jnp.where(dofs, jnp.einsum("ij,ija->a", stress, along), 0.0)
         return potential(d), slope, stiffness

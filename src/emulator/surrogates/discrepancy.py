@@ -130,11 +130,11 @@ def fit_discrepancy(
     modes, observations = _project(fields - offset, sensitivities)
     warp = _warp(expansion, positions.shape[1])
     psi: Callable[[jax.Array], jax.Array] = warp.__call__
-    features = Features(jax.vmap(psi)(positions), jax.vmap(jax.jacfwd(psi))(positions))
+    features = Features(*jax.jit(jax.vmap(lambda x: (psi(x), jax.jacfwd(psi)(x))))(positions))
     lengths = _lengths(features, np.asarray(positions), observations)
     warp = warp._replace(inverse_lengths=lengths)
     scaled = features.scaled(lengths)
-    values, folded = fold(scaled, fit_weights(scaled, observations))
+    values, folded = jax.jit(lambda f, y: fold(f, fit_weights(f, y)))(scaled, observations)
     nodal_modes = jnp.asarray(modes.reshape(-1, *offset.shape))
     return Discrepancy(warp, scaled.value, values, folded, jnp.asarray(offset), nodal_modes)
 

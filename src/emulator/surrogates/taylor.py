@@ -32,12 +32,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.errors import InputError, SolverError
+from emulator.fem.assembly import System
+from emulator.fem.compiled import compiled
 from emulator.fem.derivatives import Equations
 from emulator.fem.simulator import Simulator
 from emulator.fem.unloading import Unloader
 from emulator.surrogates.part import ArrayPart, CachedPart
 
-Terms = dict[tuple[int, ...], jax.Array]
+Terms = dict[tuple[int, ...], np.ndarray]
 """Derivatives (n, 3) mm by the parameters in which they are taken, in order."""
 
 _MOST_TERMS = 200  # in one order; 18 parameters have 171 of order 2 and 1140 of order 3
@@ -83,21 +85,21 @@ class Expansion(ArrayPart):
         Added to the part, it has the same derivatives there as FEM.
         """
         derivative, centre = part.coefficients, jnp.asarray(self.centre)
-        known: Terms = {(): derivative(centre)}
+        known: Terms = {(): np.asarray(derivative(centre))}
         for degree in range(1, self.order + 1):
             derivative = jax.jacfwd(derivative)
-            tensor = jax.jit(derivative)(centre)
+            tensor = np.moveaxis(np.asarray(jax.jit(derivative)(centre)), 0, -1)
             for term in combinations_with_replacement(range(len(centre)), degree):
-                known[term] = tensor[(slice(None), *term)]
-        modes = jnp.asarray(part.modes)
+                known[term] = tensor[term]
+        modes = np.asarray(part.modes)
         fields = [
-            jnp.tensordot(known[tuple(int(k) for k in row if k >= 0)], modes, axes=1)
+            np.tensordot(known[tuple(int(k) for k in row if k >= 0)], modes, axes=1)
             for row in self.indices
         ]
         return replace(
             self,
-            displacement=self.displacement - part.offset - jnp.tensordot(known[()], modes, axes=1),
-            derivatives=self.derivatives - jnp.stack(fields) if fields else self.derivatives,
+            displacement=self.displacement - part.offset - np.tensordot(known[()], modes, axes=1),
+            derivatives=self.derivatives - np.stack(fields) if fields else self.derivatives,
         )
 
     def rounded(self) -> Expansion:
@@ -175,9 +177,8 @@ def expand_at(
         for k, equations in enumerate(chain):
             system = equations.system
             forces, prescribed = _forces(chain[: k + 1], position, terms, known)
-            free = -jax.jit(system.solve)(equations.tangent, forces.T)
-            derivatives = jax.vmap(system.extend, in_axes=1)(free) + prescribed
-            if not jnp.isfinite(derivatives).all():
+            derivatives = np.add(_solve(system, equations.tangent, forces), prescribed)
+            if not np.isfinite(derivatives).all():
                 raise SolverError(
                     f"scene '{scene.name}': derivatives of order {degree} in theta are not finite"
                 )
@@ -185,8 +186,14 @@ def expand_at(
     if not known[0]:
         return constant(np.asarray(position), u)
     indices = np.array([[*term, *(-1,) * (order - len(term))] for term in known[0]])
-    total = sum(jnp.stack(list(h.values())) for h in known)
+    total = sum(np.stack(list(h.values())) for h in known)
     return Expansion(np.asarray(position), u, indices, jnp.asarray(total))
+
+
+@compiled
+def _solve(system: System, tangent: jax.Array, forces: jax.Array) -> jax.Array:
+    """Return the responses (t, n, 3) to ``forces`` (t, f)."""
+    return jax.vmap(system.extend, in_axes=1)(-system.solve(tangent, forces.T))
 
 
 def _forces(
@@ -209,8 +216,8 @@ def _forces(
     with_full_index = [*proper, tuple(range(degree))]
     subsets = [with_full_index if equations is not last else proper for equations in chain]
     paths = [_places(terms, parts, here) for parts, here in zip(subsets, known, strict=False)]
-    nothing = jnp.zeros((0, *last.u.shape))
-    fields = [jnp.stack(list(h.values())) if h else nothing for h in known[: len(chain)]]
+    nothing = np.zeros((0, *last.u.shape))
+    fields = [np.stack(list(h.values())) if h else nothing for h in known[: len(chain)]]
     moving = bool(scene.prescribed.per_unit)
 
     def one(
@@ -234,17 +241,17 @@ def _forces(
 
         return _mixed_derivative(along, degree)()
 
-    directions = jnp.stack([jnp.eye(len(position))[jnp.array(term)] for term in terms])
+    directions = np.stack([np.eye(len(position))[list(term)] for term in terms])
     return jax.jit(lambda d, p, k: jax.lax.map(lambda argument: one(argument, k), (d, p)))(
         directions, paths, fields
     )
 
 
-def _places(terms: list[tuple[int, ...]], parts: list[tuple[int, ...]], known: Terms) -> jax.Array:
+def _places(terms: list[tuple[int, ...]], parts: list[tuple[int, ...]], known: Terms) -> np.ndarray:
     """Return the indices (t, parts) in ``known`` of the derivatives in each part of each term."""
     places = {term: k for k, term in enumerate(known)}
     rows = [[places[tuple(term[k] for k in part)] for part in parts] for term in terms]
-    return jnp.array(rows, dtype=int).reshape(len(terms), len(parts))
+    return np.array(rows, dtype=int).reshape(len(terms), len(parts))
 
 
 def _mixed_derivative(function: Callable[..., Any], degree: int) -> Callable[[], Any]:

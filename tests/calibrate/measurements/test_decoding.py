@@ -59,8 +59,8 @@ def test_data_and_slopes_are_those_by_way_of_the_nodes(model):
     thetas = model.states.thetas({"mu": jnp.asarray(3.0)})
     by_nodes = lambda t: model.means(t, model.evaluate(t))[0]
     at_once = lambda t: model.means(t)[0]
-    for function in (lambda f: f(thetas), lambda f: jax.jacfwd(f)(thetas)):
-        found, expected = function(at_once), function(by_nodes)
+    both = lambda f: jax.jit(lambda t: (f(t), jax.jacfwd(f)(t)))(thetas)
+    for found, expected in zip(both(at_once), both(by_nodes), strict=True):
         assert found.keys() == expected.keys()
         for name in expected:
             np.testing.assert_allclose(found[name], expected[name], atol=1e-12, err_msg=name)

@@ -43,7 +43,7 @@ def scene(request, ventricle, curved):
 
 
 def seen(observe, scene, u):
-    return np.asarray(observe(jnp.asarray(u)[..., observe.nodes, :], None))
+    return np.asarray(jax.jit(lambda u: observe(u, None))(np.asarray(u)[..., observe.nodes, :]))
 
 
 def directions_at(scene, components, points):

@@ -1,5 +1,6 @@
 """Stresses of specimens: closed forms, measures, units, and tables that are wrong."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from emulator.specimens.homogeneous import Homogeneous
 from emulator.specimens.specimen import specimen
 from emulator.specimens.states import states
 from emulator.verify.homogeneous import tetrahedra
+from specimen_support import together
 
 S = np.linspace(1.0, 1.4, 5)
 MU = 7.0
@@ -29,68 +31,83 @@ def neo_hookean(columns):
     )
 
 
-def predicted(scene, components):
-    part, theta = Stress.of(scene, components), jnp.array([MU])
+def predicted(scene, components, theta=MU):
+    """Return the stresses by test, each (k, c), and the displacement."""
+    part, theta = Stress.of(scene, components), jnp.array([theta])
     u = Homogeneous(scene, all_nodes(scene), incompressible=True)(theta)
-    return np.asarray(part(u, theta))
+    stresses = np.asarray(jax.jit(part)(u, theta))
+    return {test: stresses[rows] for test, rows in scene.states.protocols.items()}, np.array(u)
 
 
 def test_incompressible_neo_hooke_in_closed_form():
     # The Cauchy stress less pressure is mu b; along one axis mu (s^2 - 1/s), along two
     # mu (s^2 - s^-4); sheared by g, mu g across and mu g^2 along, where z is free of stress.
-    one = predicted(neo_hookean({"stretch_x": S}), "cauchy_x,stress_x,second_x,cauchy_y")
-    cauchy = MU * (S**2 - 1.0 / S)
-    expected = np.stack([cauchy, cauchy / S, cauchy / S**2, 0.0 * S], axis=1)
-    np.testing.assert_allclose(one, expected, atol=1e-12)
-    two = predicted(neo_hookean({"stretch_x": S, "stretch_y": S}), "cauchy_x,cauchy_y")
-    np.testing.assert_allclose(two, MU * (S**2 - S**-4.0)[:, None] * np.ones(2), atol=1e-12)
-    held = predicted(neo_hookean({"stretch_x": S, "stretch_y": 0.0 * S + 1.0}), "cauchy_x,cauchy_y")
-    planar = np.stack([MU * (S**2 - S**-2.0), MU * (1.0 - S**-2.0)], axis=1)
-    np.testing.assert_allclose(held, planar, atol=1e-12)
     g, rest = np.linspace(0.0, 0.6, 4), np.ones(4)
-    sheared = neo_hookean({"shear_xy": g, "stretch_x": rest, "stretch_y": rest})
-    components = "cauchy_xy,cauchy_x,cauchy_y,stress_xy"
-    expected = np.stack([MU * g, MU * g**2, 0.0 * g, MU * g], axis=1)
-    np.testing.assert_allclose(predicted(sheared, components), expected, atol=1e-12)
+    scene = neo_hookean(
+        together(
+            {
+                "one": {"stretch_x": S},
+                "two": {"stretch_x": S, "stretch_y": S},
+                "held": {"stretch_x": S, "stretch_y": 0.0 * S + 1.0},
+                "sheared": {"shear_xy": g, "stretch_x": rest, "stretch_y": rest},
+            }
+        )
+    )
+    found, _ = predicted(scene, "cauchy_x,cauchy_y,cauchy_xy,stress_xy,stress_x,second_x")
+    cauchy, zero = MU * (S**2 - 1.0 / S), 0.0 * S
+    for test, columns in {
+        "one": [cauchy, zero, zero, zero, cauchy / S, cauchy / S**2],
+        "two": [MU * (S**2 - S**-4.0)] * 2,
+        "held": [MU * (S**2 - S**-2.0), MU * (1.0 - S**-2.0)],
+        "sheared": [MU * g**2, 0.0 * g, MU * g, MU * g],
+    }.items():
+        expected = np.stack(columns, axis=1)
+        np.testing.assert_allclose(found[test][:, : len(columns)], expected, atol=1e-12)
 
 
 def test_all_six_shears_of_fibres_have_their_stress():
     """The energy's own derivative along each shear, of a law whose six shears differ."""
-    amounts = np.array([0.1, 0.3])
-    for i, j in ((0, 1), (1, 0), (0, 2), (2, 0), (1, 2), (2, 1)):
-        plane = "xyz"[i] + "xyz"[j]
-        free = ({0, 1, 2} - {i, j}).pop()
-        held = {f"stretch_{a}": np.ones(2) for k, a in enumerate("xyz") if k != free}
-        scene = specimen(
-            {**held, f"shear_{plane}": amounts},
-            law=em.find_law("holzapfel_ogden_orthotropic"),
-            parameters=(em.Parameter("a", "kPa", 0.1, 2.0),),
-            constants={
-                "b": 7.0, "a_f": 15.0, "b_f": 15.0, "a_s": 2.0, "b_s": 10.0, "a_fs": 0.4,
-                "b_fs": 9.0, "kappa": 50.0,
-            },
-            fibres=[1.0, 0.0, 0.0], sheets=[0.0, 1.0, 0.0],
-        )  # fmt: skip
-        theta = jnp.array([0.5])
-        u = Homogeneous(scene, all_nodes(scene), incompressible=True)(theta)
-        shear = np.asarray(Stress.of(scene, f"stress_{plane}")(u, theta))[:, 0]
-        step = 1e-6
-        energies = []
-        for sign in (-1.0, 1.0):
-            moved = np.array(u)
-            moved[j::3, i] += sign * step
-            energies.append(density(scene, moved, theta))
-        np.testing.assert_allclose(shear, (energies[1] - energies[0]) / (2.0 * step), rtol=1e-6)
+    planes = [(i, j) for i in range(3) for j in range(3) if i != j]
+    words = ["xyz"[i] + "xyz"[j] for i, j in planes]
+    held = [[a for a in "xyz" if a in word] for word in words]
+    scene = specimen(
+        together(
+            {
+                word: {f"shear_{word}": [0.1, 0.3], **{f"stretch_{a}": np.ones(2) for a in axes}}
+                for word, axes in zip(words, held, strict=True)
+            }
+        ),
+        law=em.find_law("holzapfel_ogden_orthotropic"),
+        parameters=(em.Parameter("a", "kPa", 0.1, 2.0),),
+        constants={
+            "b": 7.0, "a_f": 15.0, "b_f": 15.0, "a_s": 2.0, "b_s": 10.0, "a_fs": 0.4,
+            "b_fs": 9.0, "kappa": 50.0,
+        },
+        fibres=[1.0, 0.0, 0.0], sheets=[0.0, 1.0, 0.0],
+    )  # fmt: skip
+    found, u = predicted(scene, ",".join(f"stress_{word}" for word in words), 0.5)
+    energy, step = densities(scene, jnp.array([0.5])), 1e-6
+    for k, ((i, j), word) in enumerate(zip(planes, words, strict=True)):
+        shear = np.zeros_like(u)
+        shear[j::3, i] = step
+        slope = (energy(u + shear) - energy(u - shear)) / (2.0 * step)
+        rows = scene.states.protocols[word]
+        np.testing.assert_allclose(found[word][:, k], slope[rows], rtol=1e-6)
 
 
-def density(scene, u, theta):
+def densities(scene, theta):
     """The energy density of each state, from FEM's potential of a tetrahedron alone."""
     body = tetrahedra(scene)
     count = len(body.mesh.elements)
-    at_corners = np.concatenate([np.zeros((count, 1, 3)), u.reshape(count, 3, 3)], axis=1)
     whole, volume = em.strain_energy(body), body.discretisation.weights.sum() / count
-    alone = (at_corners * (np.arange(count) == k)[:, None, None] for k in range(count))
-    return np.array([float(whole(jnp.asarray(x.reshape(-1, 3)), theta)) for x in alone]) / volume
+
+    @jax.jit
+    def of_each(u):
+        at_corners = jnp.concatenate([jnp.zeros((count, 1, 3)), u.reshape(count, 3, 3)], axis=1)
+        alone = jnp.eye(count)[:, :, None, None] * at_corners
+        return jax.vmap(lambda x: whole(x.reshape(-1, 3), theta))(alone) / volume
+
+    return lambda u: np.asarray(of_each(u))
 
 
 def test_a_table_is_read_in_its_units(tmp_path):

@@ -1,5 +1,6 @@
 """Stretches under load control: closed forms, tables, and what is read and written again."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from calibrate.measurements.data import read_measurements, write_data
 from calibrate.measurements.stretch import Stretch
 from emulator.core.errors import InputError
 from emulator.specimens.specimen import read_states, specimen
+from specimen_support import together
 
 S = np.linspace(1.0, 1.4, 5)
 MU = 7.0
@@ -27,25 +29,25 @@ def neo_hookean(given, **entries):
     )
 
 
-def predicted(columns, components):
-    scene, theta = neo_hookean(columns), jnp.array([MU])
-    u = em.homogeneous(scene, incompressible=True)(theta)
-    return np.asarray(cal.stretches(scene, components)(u, theta))
-
-
 def test_incompressible_neo_hooke_in_closed_form():
     # P = mu (s - s^-2) along one axis, mu (s - s^-5) along two; others keep the volume.
-    one = predicted({"applied_y": MU * (S - S**-2.0)}, "stretch_y,stretch_x,stretch_z")
-    np.testing.assert_allclose(one, np.stack([S, S**-0.5, S**-0.5], axis=1), atol=1e-12)
-    pull = MU * (S - S**-5.0)
-    two = predicted({"applied_x": pull, "applied_y [Pa]": 1e3 * pull}, "stretch_x,stretch_y")
-    np.testing.assert_allclose(two, np.stack([S, S], axis=1), atol=1e-12)
     # Pulls along all three axes: those of two less their mean pressure's, here mu s of one.
-    pull = {"applied_x": 2.0 * MU * S, "applied_y": 2.0 * MU / np.sqrt(S)}
-    three = predicted({**pull, "applied_z": 2.0 * MU / np.sqrt(S)}, "stretch_x,stretch_z")
-    lam, mean = three.T, MU * (three[:, 0] ** 2 - three[:, 1] ** 2)
-    residual = pull["applied_x"] * lam[0] - pull["applied_y"] * lam[1] - mean
-    np.testing.assert_allclose(residual, 0.0, atol=1e-11)
+    two, x, y = MU * (S - S**-5.0), 2.0 * MU * S, 2.0 * MU / np.sqrt(S)
+    tests = {
+        "one": {"applied_y [Pa]": 1e3 * MU * (S - S**-2.0)},
+        "two": {"applied_x": two, "applied_y [Pa]": 1e3 * two},
+        "three": {"applied_x": x, "applied_y [Pa]": 1e3 * y, "applied_z": y},
+    }
+    scene, theta = neo_hookean(together(tests)), jnp.array([MU])
+    u = em.homogeneous(scene, incompressible=True)(theta)
+    stretches = 1.0 + np.asarray(u).reshape(-1, 3, 3).diagonal(axis1=1, axis2=2)
+    one, two, three = (stretches[scene.states.protocols[test]] for test in tests)
+    np.testing.assert_allclose(one, np.stack([S**-0.5, S, S**-0.5], axis=1), atol=1e-12)
+    np.testing.assert_allclose(two[:, :2], np.stack([S, S], axis=1), atol=1e-12)
+    mean = MU * (three[:, 0] ** 2 - three[:, 2] ** 2)
+    np.testing.assert_allclose(x * three[:, 0] - y * three[:, 2] - mean, 0.0, atol=1e-11)
+    observe = jax.jit(cal.stretches(scene, "stretch_z,stretch_x"))
+    np.testing.assert_allclose(observe(u, theta), stretches[:, [2, 0]], atol=1e-15)
 
 
 MIXED = """protocol,applied_x [MPa],strain_x [%],stretch_y,cauchy_y

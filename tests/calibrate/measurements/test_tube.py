@@ -32,9 +32,14 @@ def neo_hookean(tube, columns=COLUMNS, **entries):
 
 
 def predicted(scene, theta=MU):
-    forward, theta = em.homogeneous(scene, incompressible=True), jnp.array([theta])
-    u = forward(theta)
-    return [np.asarray(kind(scene)(u, theta)) for kind in (cal.TubePressure, cal.TubeForce)]
+    forward, kinds = em.homogeneous(scene, incompressible=True), (cal.TubePressure, cal.TubeForce)
+
+    @jax.jit
+    def both(theta):
+        u = forward(theta)
+        return [kind(scene)(u, theta) for kind in kinds]
+
+    return [np.asarray(values) for values in both(jnp.array([theta]))]
 
 
 def closed_form(tube, columns):

@@ -65,14 +65,17 @@ def test_cut_to_a_range_its_density_is_normalised(beam):
     low, high = zip(*((p.low, p.high) for p in beam.parameters), strict=True)
     x, y = (0.5 * (a + b) + 0.5 * (b - a) * nodes for a, b in zip(low, high, strict=True))
     names = model.states.unknowns
-    first = jax.vmap(model.prior[names[0]].log_prob)(x)
 
     def given(value):
         mean, sd = model.dependence.given_earlier(names[1], model.prior, {names[0]: value})
         second = model.prior[names[1]]
         return jax.vmap(Conditional(second, mean, sd, second.support).log_prob)(y)
 
-    density = jnp.exp(first[:, None] + jax.vmap(given)(jnp.asarray(x)))
+    @jax.jit
+    def joint(x):
+        return jnp.exp(jax.vmap(model.prior[names[0]].log_prob)(x)[:, None] + jax.vmap(given)(x))
+
+    density = joint(x)
     area = 0.25 * np.prod(np.subtract(high, low))
     assert area * weights @ density @ weights == pytest.approx(1.0, abs=2e-3)
 

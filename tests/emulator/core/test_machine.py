@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from threadpoolctl import threadpool_info
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import emulator as em
 from emulator.core import machine
@@ -89,11 +89,12 @@ def test_blas_is_held_to_one_thread_and_let_go():
     def threads():
         return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
 
-    before, inside = threads(), machine.one_blas_thread()(threads)
-    assert inside() == inside() == {1}
-    with machine.one_blas_thread():
-        assert threads() == {1}
-    assert threads() == before
+    inside = machine.one_blas_thread()(threads)
+    with threadpool_limits(2, user_api="blas"):
+        assert inside() == inside() == {1}
+        with machine.one_blas_thread():
+            assert threads() == {1}
+        assert threads() == {2}
 
 
 @pytest.mark.parametrize(

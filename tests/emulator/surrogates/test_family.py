@@ -210,8 +210,8 @@ def test_linear_responses() -> None:
         density = MATRIX * square + 0.5 * bulk * trace**2 + 2.0 * fibre * along**2
         return jnp.sum(grid.weights * density)
 
-    forces = jax.grad(energy)
-    pressure = -jax.grad(em.fem.energy.potential_energy(scene))(
+    forces = jax.jit(jax.grad(energy))
+    pressure = -jax.jit(jax.grad(em.fem.energy.potential_energy(scene)))(
         jnp.zeros(scene.held.shape), scene.centre.at[-1].set(1.0)
     )
     free = ~scene.held
@@ -230,7 +230,7 @@ def test_the_force_of_a_pressure_is_the_slope_of_the_volume() -> None:
     scene = body(**SHAPES[1])
     u = 0.1 * ~scene.held * np.sin(scene.mesh.nodes)
     cavity = Cavity(scene.mesh, "endocardium")
-    slope = jax.grad(cavity)(jnp.asarray(u[cavity.nodes])) * MM3_PER_ML
+    slope = jax.jit(jax.grad(cavity))(u[cavity.nodes]) * MM3_PER_ML
     force = pressure_force(scene.mesh, scene.mesh.nodes + u, "endocardium")[cavity.nodes]
     free = ~scene.held[cavity.nodes]
     assert np.allclose(force[free], slope[free], atol=1e-8)

@@ -73,20 +73,22 @@ def test_renumbering_the_nodes_renumbers_the_states(beam):
         receivers=new[graph.receivers],
         real=count,
     )
-    np.testing.assert_allclose(processor(renumbered)[new], processor(everything), atol=1e-4)
+    states = jax.jit(lambda: (processor(renumbered), processor(everything)))
+    after, before = map(np.asarray, states())
+    np.testing.assert_allclose(after[new], before, atol=1e-4)
 
 
 def test_an_untrained_emulator_is_its_offset(beam):
     offset = np.random.default_rng(0).normal(size=beam.held.shape)
     network = fresh(beam, augment(beam), SMALL, np.ones(3), 0)
     emulator = Emulator(beam, taylor=constant(np.full(2, 0.5), offset), network=network)
-    expected = np.where(beam.held, 0.0, offset)
-    np.testing.assert_array_equal(emulator(beam.centre), expected)
-    np.testing.assert_array_equal(emulator(beam.centre * 1.2), expected)
+    expected, predict = np.where(beam.held, 0.0, offset), jax.jit(emulator)
+    np.testing.assert_array_equal(predict(beam.centre), expected)
+    np.testing.assert_array_equal(predict(beam.centre * 1.2), expected)
 
 
 def test_held_values_are_exact(cube):
-    u = untrained(cube)(cube.centre)
+    u = jax.jit(untrained(cube))(cube.centre)
     np.testing.assert_array_equal(np.asarray(u)[cube.held], cube.held_displacement[cube.held])
     assert np.abs(np.asarray(u)[~cube.held]).min() > 0.0
 
@@ -94,14 +96,15 @@ def test_held_values_are_exact(cube):
 def test_cached_equals_uncached_in_value_and_gradient(emulator, beam):
     cached = emulator.cache()
     weights = jnp.asarray(np.random.default_rng(0).normal(size=beam.held.shape))
+    value, of_cached = (
+        jax.jit(lambda t, f=f: (f(t), jax.grad(lambda t: jnp.vdot(weights, f(t)))(t)))
+        for f in (emulator, cached)
+    )
     for theta in beam.from_unit(jnp.array([[0.1, 0.9], [0.5, 0.5], [1.0, 0.0]])):
-        exact = emulator(theta)
-        np.testing.assert_allclose(
-            cached(theta), exact, atol=1e-6 * float(jnp.max(jnp.abs(exact))), rtol=0
-        )
-        a, b = (jax.grad(lambda t, f=f: jnp.vdot(weights, f(t)))(theta) for f in (emulator, cached))
+        (exact, a), (u, b) = value(theta), of_cached(theta)
+        np.testing.assert_allclose(u, exact, atol=1e-6 * np.max(np.abs(exact)), rtol=0)
         # In float32, summed in another order: 1.06e-6 on one processor, less on others.
-        np.testing.assert_allclose(a, b, atol=4e-6 * float(jnp.max(jnp.abs(b))), rtol=0)
+        np.testing.assert_allclose(a, b, atol=4e-6 * np.max(np.abs(b)), rtol=0)
 
 
 def test_only_the_nodes_asked_for_are_decoded(emulator, beam):
@@ -157,8 +160,16 @@ def test_the_shipped_emulator_cached_and_not():
     shipped = em.load("once_clamped_beam")
     cached = shipped.cache()
     theta = shipped.scene.theta(mu=57.0, lam=93.0)
-    relative = lambda a, b: float(jnp.max(jnp.abs(a - b)) / jnp.max(jnp.abs(b)))
-    assert relative(cached(theta), shipped(theta)) < 1e-6
-    assert relative(jax.jacfwd(cached)(theta), jax.jacfwd(shipped)(theta)) < 1e-6
-    squares = [jax.grad(lambda t, m=m: jnp.sum(m(t) ** 2))(theta) for m in (cached, shipped)]
-    np.testing.assert_allclose(*squares, rtol=1e-5)  # the network is of float32
+    relative = lambda a, b: np.max(np.abs(a - b)) / np.max(np.abs(b))
+
+    def both(forward):
+        def value_slopes_and_gradient(t):
+            gradient = jax.grad(lambda t: jnp.sum(forward(t) ** 2))(t)
+            return forward(t), jax.jacfwd(forward)(t), gradient
+
+        return jax.jit(value_slopes_and_gradient)(theta)
+
+    (u, slopes, gradient), (v, others, other) = both(cached), both(shipped)
+    assert relative(u, v) < 1e-6
+    assert relative(slopes, others) < 1e-6
+    np.testing.assert_allclose(gradient, other, rtol=1e-5)  # the network is of float32
