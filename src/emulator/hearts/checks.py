@@ -11,11 +11,19 @@ from scipy.spatial import cKDTree
 from emulator.core.errors import InputError
 from emulator.core.units import MM3_PER_ML
 from emulator.geometry.mesh import signed_volumes
-from emulator.hearts.surfaces import Surface, distances, inside, place_of, rim_loops
+from emulator.hearts.surfaces import (
+    Surface,
+    axis_to_rims,
+    distances,
+    inside,
+    place_of,
+    rim_loops,
+)
 from emulator.hearts.wall import Wall
 
 _MARGIN = 0.015  # of the extent, from rims: where surfaces meet, round-off decides
 _SAME = 0.01  # of the extent: surfaces nearer to each other, in the median, are one
+_CLEARLY = 0.3  # cosine, above which a direction is clear
 _THICK = 20.0, 2.5  # mm and medians; no wall of a left ventricle is thicker than the lesser
 _THICK_SHARE = 0.02  # of the wall, above which its thick part is worth a word
 _FILLED = 0.1, 4.0  # volumes of a left ventricle's cavity over its wall's lie between
@@ -23,46 +31,102 @@ _FILLED = 0.1, 4.0  # volumes of a left ventricle's cavity over its wall's lie b
 
 def check_places(surfaces: Sequence[Surface]) -> None:
     """Raise :class:`InputError` unless endocardia lie beside each other in the epicardium, last."""
-    *inner, outer = surfaces
-    margin = _MARGIN * outer.extent
+    outer = surfaces[-1]
     for one, other in combinations(surfaces, 2):
         if np.median(distances(one.points, [other])) < _SAME * outer.extent:
             raise InputError(f"{one.name} and {other.name} are one surface; give one of each wall")
+    for one, other, where in crossings(surfaces):
+        _refuse(one, other, where, astray(one, other, where, _MARGIN * outer.extent))
+
+
+def crossings(surfaces: Sequence[Surface]) -> Iterator[tuple[Surface, Surface, str]]:
+    """Yield pairs of surfaces, the epicardium last, and where the first one must not be."""
+    *inner, outer = surfaces
     for surface in inner:
-        if inside(surface, outer.points).mean() > 0.5:
-            raise InputError(
-                f"{surface.name} and {outer.name} are swapped: the epicardium lies within it"
-            )
-        points = _off_rims(surface, margin)
-        _check_side(surface, points, ~inside(outer, points), outer, "outside")
-        points = _off_rims(outer, margin)
-        _check_side(outer, points, inside(surface, points), surface, "inside")
-        for other in inner:
-            if other is not surface:
-                within = inside(other, surface.points)
-                _check_side(surface, surface.points, within, other, "inside")
+        yield outer, surface, "inside"
+        yield surface, outer, "outside"
+        yield from ((surface, other, "inside") for other in inner if other is not surface)
 
 
-def _off_rims(surface: Surface, margin: float) -> np.ndarray:
-    """Return the points (k, 3) that are further than ``margin`` mm from all rims."""
-    rims = cKDTree(surface.points[np.concatenate(rim_loops(surface))], balanced_tree=False)
-    return surface.points[rims.query(surface.points)[0] > margin]
+def astray(surface: Surface, other: Surface, where: str, margin: float) -> np.ndarray:
+    """Return the points (k, 3) mm of a surface that are ``inside`` or ``outside`` of another.
+
+    margin : mm, distance from the rims within which points do not count.
+    """
+    rims = [surface.points[loop] for loop in rim_loops(surface)]
+    points = surface.points
+    if rims:
+        ways = cKDTree(np.concatenate(rims), balanced_tree=False).query(points)[0]
+        points = points[ways > margin]
+    return points[inside(other, points) == (where == "inside")]
 
 
-def _check_side(
-    surface: Surface, points: np.ndarray, wrong: np.ndarray, other: Surface, where: str
-) -> None:
-    """Raise :class:`InputError` if any of the surface's points (k, 3) is on the ``wrong`` side."""
-    if wrong.all():
+def _refuse(surface: Surface, other: Surface, where: str, points: np.ndarray) -> None:
+    """Raise :class:`InputError` if there are points (k, 3) of a surface on the wrong side."""
+    share = len(points) / len(surface.points)
+    if share > 0.5 and where == "inside":
+        raise InputError(
+            f"{other.name} and {surface.name} are swapped: the latter lies within the former"
+        )
+    if share > 0.9:
         raise InputError(
             f"{surface.name} lies {where} of {other.name}: its middle is at "
             f"{place_of(surface.points.mean(axis=0))}, the other's at "
             f"{place_of(other.points.mean(axis=0))}"
         )
-    if wrong.any():
+    if len(points):
         raise InputError(
-            f"{surface.name} crosses {other.name}: {int(wrong.sum())} of its {len(wrong)} points "
-            f"are {where}, around {place_of(points[wrong].mean(axis=0))}; repair them there"
+            f"{surface.name} crosses {other.name}: {len(points)} of its {len(surface.points)} "
+            f"points are {where}, around {place_of(points.mean(axis=0))}; repair them there"
+        )
+
+
+def check_sides(left: Surface, right: Surface, outer: Surface) -> None:
+    """Raise :class:`InputError` if the right endocardium is the left ventricle's.
+
+    The left ventricle is round and its wall thick; the right one wraps it, and its wall is thin.
+    """
+    swapped = (
+        roundness(left) < roundness(right),
+        _free_wall(left, right, outer) < _free_wall(right, left, outer),
+    )
+    if all(swapped):
+        raise InputError(
+            f"{left.name} and {right.name} are swapped: the left ventricle is the round one, with "
+            "the thicker wall"
+        )
+
+
+def roundness(surface: Surface) -> float:
+    """Return the enclosed volume over that of the convex hull."""
+    return float(surface.volume / surface.mesh.convex_hull.volume)
+
+
+def _free_wall(surface: Surface, other: Surface, outer: Surface) -> float:
+    """Return the median thickness in mm of the wall that is not the septum."""
+    ways = distances(surface.points, [outer])
+    return float(np.median(ways[ways < distances(surface.points, [other])]))
+
+
+def mirrored(surfaces: Sequence[Surface]) -> Iterator[str]:
+    """Yield a sentence if the valves of left and right endocardium lie as in a mirrored heart.
+
+    Seen from the apex to the base, with the right ventricle on the right, both ventricles' outlets
+    (the shorter rims) lie before their inlets in every heart; a mirrored one has them behind.
+    """
+    left, right = surfaces[:2]
+    forward = np.cross(axis_to_rims(left), right.points.mean(axis=0) - left.points.mean(axis=0))
+    loops = [rim_loops(surface) for surface in (left, right)]
+    if min(map(len, loops)) < 2:
+        return
+    cosines = []
+    for surface, (inlet, outlet, *_) in zip((left, right), loops, strict=True):
+        way = surface.points[outlet].mean(axis=0) - surface.points[inlet].mean(axis=0)
+        cosines.append(way @ forward / np.linalg.norm(way) / np.linalg.norm(forward))
+    if max(cosines) < -_CLEARLY:
+        yield (
+            "the valves lie as in a mirrored heart, whose fibres by rule have the wrong hand: is "
+            "one coordinate of the surfaces reversed (x of LPS and RAS)?"
         )
 
 

@@ -25,7 +25,7 @@ import numpy as np
 from emulator.core.errors import InputError, look_up
 from emulator.core.units import IN_MM, MM3_PER_ML
 from emulator.geometry.fibres import BOTH
-from emulator.hearts.checks import check_places, doubts
+from emulator.hearts.checks import check_places, check_sides, doubts, mirrored
 from emulator.hearts.joints import (
     LEAST,
     joints_of,
@@ -35,12 +35,14 @@ from emulator.hearts.joints import (
 )
 from emulator.hearts.left_wall import left_wall
 from emulator.hearts.remeshing import DiscMap
+from emulator.hearts.splitting import split_muscle
 from emulator.hearts.surfaces import (
     Surface,
     axis_to_rims,
     cut,
     distances,
     one_rim,
+    place_of,
     rim_loops,
     smoothed,
 )
@@ -110,27 +112,16 @@ def mesh_wall(
         apart, or cross; lengths that are not in mm; no Gmsh; or a wall too thin for ``size`` mm,
         or for any.
     """
-    both = right is not None and ventricles != "left"
     _check_options(order, unit, smooth, least, ventricles, right)
     sources = [(endocardium, BOTH[0]), (right, BOTH[1]), (epicardium, BOTH[2])]
-    intact = [surface_in_mm(source, name, unit) for source, name in sources if source is not None]
-    if not both:
-        intact[0] = replace(intact[0], name="endocardium")
-    if right is not None and not both:
-        left = left_wall(intact[0], intact[2], intact[1])
-        intact = [intact[0], left.outside]
-        if axis is None:
-            axis = left.axis.tolist()
-            if base_height is None and base_point is None:
-                base_height = left.height
-    is_cut = not both or (axis, base_height, base_point) != (None, None, None)
-    base = _below(intact, axis, base_height, base_point) if is_cut else _at_valves(intact)
+    read = [surface_in_mm(source, name, unit) for source, name in sources if source is not None]
+    intact, plane, notes = _walls(read, Plane(axis, base_height, base_point), ventricles)
+    both, is_cut = len(intact) == 3, plane != Plane()
+    base = _below(intact, plane) if is_cut or not both else _at_valves(intact)
     *inner, outer = (smoothed(surface, smooth) for surface in base.surfaces)
-    if not is_cut:
-        joints_of([*inner, outer])
     check_places([*inner, outer])
     outside = thickened(outer, inner, least) if both else outer
-    surfaces = [*inner, outside if is_cut else without_edge(outside, inner)]
+    surfaces = [*inner, without_edge(outside, inner) if both and not is_cut else outside]
     thickness = thickness_of(distances(inner[0].points, surfaces[1:]))
     area = sum(surface.mesh.area for surface in surfaces)
     usual = np.sqrt(area / _SQUARES) if both else _SIZE * thickness.median
@@ -149,7 +140,53 @@ def mesh_wall(
         cut_off=base.cut_off,
     )
     volumes = [surface.volume / MM3_PER_ML for surface in inner]
-    return replace(wall, warnings=tuple(doubts(wall, volumes)))
+    return replace(wall, warnings=(*notes, *doubts(wall, volumes)))
+
+
+class Plane(NamedTuple):
+    """The base plane as far as it is known: axis, height along it, or a point."""
+
+    axis: Sequence[float] | None = None
+    height: float | None = None
+    point: Sequence[float] | None = None
+
+
+def _walls(
+    surfaces: list[Surface], plane: Plane, ventricles: str | None
+) -> tuple[list[Surface], Plane, list[str]]:
+    """Return the surfaces that walls are between, the epicardium last, the base plane, and notes.
+
+    surfaces : the surfaces that were read: endocardium, or both, and epicardium.
+    """
+    notes: list[str] = []
+    if len(surfaces) == 3:
+        check_sides(*surfaces)
+        notes += mirrored(surfaces)
+    elif _are_one(*surfaces):
+        surfaces, axis = split_muscle(replace(surfaces[0], name="the muscle"), *plane)
+        at = float((surfaces[-1].points @ axis).max())
+        plane = Plane(axis.tolist())
+        notes.append(
+            f"one closed surface has both walls: split at {at:.4g} mm along the axis "
+            f"{place_of(axis)}, where it falls into {len(surfaces)} surfaces"
+        )
+    if len(surfaces) == 3 and ventricles != "left":
+        return [replace(s, name=name) for s, name in zip(surfaces, BOTH, strict=True)], plane, notes
+    inner, *right, outer = surfaces
+    inner = replace(inner, name="endocardium")
+    if not right:
+        return [inner, replace(outer, name="epicardium")], plane, notes
+    left = left_wall(inner, outer, right[0])
+    if plane.axis is None:
+        at_all = plane.height is not None or plane.point is not None
+        plane = Plane(left.axis.tolist(), plane.height if at_all else left.height, plane.point)
+    return [inner, left.outside], plane, notes
+
+
+def _are_one(endocardium: Surface, epicardium: Surface) -> bool:
+    """Return whether two surfaces are one, and closed."""
+    same = endocardium.points.shape == epicardium.points.shape and not endocardium.rims
+    return bool(same and np.allclose(endocardium.points, epicardium.points))
 
 
 def _check_options(
@@ -187,14 +224,9 @@ def _at_valves(surfaces: list[Surface]) -> Base:
     return Base(surfaces, axis_to_rims(surfaces[0]), (0.0, 0.0))
 
 
-def _below(
-    surfaces: Sequence[Surface],
-    axis: Sequence[float] | None,
-    height: float | None,
-    at: Sequence[float] | None,
-) -> Base:
+def _below(surfaces: Sequence[Surface], plane: Plane) -> Base:
     """Return what is below the base plane of surfaces, the epicardium last."""
-    normal, point = _plane(surfaces, axis, height, at)
+    normal, point = _place(surfaces, plane)
     below, outer = [cut(surface, point, normal) for surface in surfaces], surfaces[-1]
     for surface in below:
         rim = surface.points[one_rim(surface)] @ normal
@@ -210,13 +242,9 @@ def _below(
     return Base(below, normal, (above, (outer.volume - below[-1].volume) / MM3_PER_ML))
 
 
-def _plane(
-    surfaces: Sequence[Surface],
-    axis: Sequence[float] | None,
-    height: float | None,
-    point: Sequence[float] | None,
-) -> tuple[np.ndarray, np.ndarray]:
+def _place(surfaces: Sequence[Surface], plane: Plane) -> tuple[np.ndarray, np.ndarray]:
     """Return the normal (3,) and a point (3,) of the base plane."""
+    axis, height, point = plane
     if height is not None and point is not None:
         raise InputError(
             "base plane: give a height or a point, not both (--base-height, --base-point)"

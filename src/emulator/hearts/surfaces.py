@@ -77,12 +77,12 @@ class Surface:
         """Diagonal of the bounding box, mm."""
         return float(np.linalg.norm(np.ptp(self.points, axis=0)))
 
-    @property
+    @cached_property
     def rims(self) -> list[np.ndarray]:
         """Edges (e, 2) of each opening."""
         return openings(self.triangles)
 
-    @property
+    @cached_property
     def volume(self) -> float:
         """Enclosed with flat lids, mm3."""
         middle = self.points - self.points.mean(axis=0)
@@ -241,12 +241,16 @@ def one_rim(surface: Surface, is_cut: bool = False) -> np.ndarray:
     if not rims:
         raise InputError(
             f"{surface.name}: it is closed; give the base plane, a height along the long axis or a "
-            "point: --axis with --base-height or --base-point"
+            "point: --axis with --base-height or --base-point; one closed surface of the muscle, "
+            "with both walls, is given as endocardium and as epicardium"
         )
     small = surface.points[np.unique(rims[0])].mean(axis=0)
     remedy = "give a base plane below them, --base-height or --base-point, and --axis"
     if is_cut:
-        remedy = "lower the base plane, --base-height or --base-point, or turn --axis around"
+        remedy = (
+            "lower the base plane, --base-height or --base-point, or turn --axis around; one "
+            "surface with both walls is given as endocardium and as epicardium"
+        )
     raise InputError(
         f"{surface.name}: it has {len(rims)} openings, the smallest of {len(rims[0])} edges at "
         f"{place_of(small)}; expected the base's alone: fill the others, or {remedy}"

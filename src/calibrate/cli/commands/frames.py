@@ -59,6 +59,7 @@ from emulator.core.store import check_folder
 def frames(arguments: Namespace) -> Answer:
     """Measure the surfaces, and write the data."""
     from calibrate.measurements.data import write_data
+    from calibrate.measurements.frame_checks import frame_doubts
     from calibrate.measurements.frames import frame_data
     from calibrate.state_names import states_of
     from emulator.core.errors import look_up
@@ -80,9 +81,11 @@ def frames(arguments: Namespace) -> Answer:
                 f"--surface '{word}'; give each as SET@STATE=FILE, such as lv_endocardium@es=lv.obj"
             )
         surfaces[name] = read_surface(path, name, IN_MM[arguments.unit])
-    observe, data = frame_data(words.scene_of(arguments), surfaces, arguments.points)
+    scene = words.scene_of(arguments)
+    observe, data = frame_data(scene, surfaces, arguments.points)
+    doubts = [*frame_doubts(scene.mesh, surfaces, observe, data)]
     write_data(arguments.out, observe, data)
-    return _measured(data, arguments.out)
+    return _measured(data, arguments.out, doubts)
 
 
 def _full_field(arguments: Namespace) -> Answer:
@@ -94,6 +97,7 @@ def _full_field(arguments: Namespace) -> Answer:
     from calibrate.measurements.data import write_data
     from calibrate.measurements.full_field import (
         field_data,
+        field_doubts,
         read_amounts,
         read_curve,
         read_full_field,
@@ -113,6 +117,7 @@ def _full_field(arguments: Namespace) -> Answer:
     loaded_frames = [frame for frame in field.frames if amounts.get(frame) != 0.0]
     count = min(arguments.points, len(field.points))
     field = field.only(arguments.only or loaded_frames, spread_points(field.points, count))
+    doubts = [*field_doubts(scene, field, amounts, parameter)]
     observe, data = field_data(scene, field, amounts)
     parts = dict(observe.parts)
     for curve in arguments.force:
@@ -132,7 +137,7 @@ def _full_field(arguments: Namespace) -> Answer:
             data[in_state(name, frame)] = np.array(np.interp(amounts[frame], at, force))
     known = {in_state(parameter, frame): amounts[frame] for frame in field.frames}
     write_data(arguments.out, observations(parts), data, known)
-    return _measured(data, arguments.out)
+    return _measured(data, arguments.out, doubts)
 
 
 def _split(word: str, flag: str, usage: str) -> list[str]:
@@ -144,8 +149,8 @@ def _split(word: str, flag: str, usage: str) -> list[str]:
     return parts
 
 
-def _measured(data: Mapping[str, Any], out: str) -> Answer:
-    """Return a table of the measured data."""
+def _measured(data: Mapping[str, Any], out: str, doubts: list[str]) -> Answer:
+    """Return a table of the measured data, and what is doubtful about them."""
     import numpy as np
 
     rows, result = [], {}
@@ -159,4 +164,5 @@ def _measured(data: Mapping[str, Any], out: str) -> Answer:
         result[name] = of
         rows.append((name, f"{of['mean']:.4g}", f"{of['sd']:.3g}", of["missing"]))
     text = table(("data", "mean (mm, mL, N)", "sd", "missing"), rows)
-    return Answer({"out": out, "data": result}, f"{text}\nwritten to {out}")
+    result = {"out": out, "data": result, "warnings": doubts}
+    return Answer(result, "\n".join([text, *doubts, f"written to {out}"]))
