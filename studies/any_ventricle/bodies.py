@@ -13,9 +13,8 @@ from studies.any_ventricle.shapes import USUAL, Body, bodies
 
 from emulator.geometry.facets import flat_triangles
 from emulator.geometry.mesh import Mesh
-from emulator.hearts.heart import mesh_wall
+from emulator.hearts.heart import Wall, mesh_wall
 from emulator.hearts.surfaces import Surface
-from emulator.hearts.wall import Wall
 from emulator.scenes.built_in.ventricles import MYOCARDIUM, PRESSURE
 from emulator.scenes.fibre_rules import Helix
 from emulator.scenes.scene import Scene

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -41,7 +41,7 @@ _CROSSING = 0.005  # of the size
 _MARGIN = 0.02  # of the size, from rims: surfaces meet there
 _VOLUMES = 3.0  # of an endocardium's volume over the body's, or the reverse
 _WALL = 0.75, 1.3  # of a frame's wall volume over the body's
-_SEPTUM = 0.78, 1.34  # of its thickness over the body's, at its thin end
+_SEPTUM = 0.68, 1.45  # of its thickness over the body's, at its thin end
 _STROKES = 0.3  # of a cavity, by which changes of two cavities may differ
 _THIN = 0.05  # quantile of distances between endocardia that is the septum's thin end
 
@@ -88,7 +88,8 @@ def frame_doubts(
     for name, frame in surfaces.items():
         facet_set, state = split(name)
         states.setdefault(state, {})[facet_set] = replace(frame, name=name)
-        fit = fit_motion(observe.parts[f"surface:{name}"], data[f"surface:{name}"])
+        part = cast(SurfacePoints, observe.parts[f"surface:{name}"])
+        fit = fit_motion(part, data[f"surface:{name}"])
         missing = int(np.isnan(data[f"surface:{name}"]).sum())
         if missing > _MISSING * len(data[f"surface:{name}"]):
             yield (

@@ -164,7 +164,7 @@ def _walls(
         notes += mirrored(surfaces)
     elif _are_one(*surfaces):
         surfaces, axis = split_muscle(replace(surfaces[0], name="the muscle"), *plane)
-        at = float((surfaces[-1].points @ axis).max())
+        at = round(float((surfaces[-1].points @ axis).max()), 6) + 0.0
         plane = Plane(axis.tolist())
         notes.append(
             f"one closed surface has both walls: split at {at:.4g} mm along the axis "

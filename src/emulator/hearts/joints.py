@@ -230,4 +230,4 @@ def _joined(
     height = (ways @ at[:, 2]) / ways.sum(axis=1)
     number = np.concatenate([on_loops, np.arange(count, count + len(inner))])
     added = np.column_stack([inner, height])
-    return number[rows], transform_points(added, np.linalg.inv(to_plane))
+    return number[rows], (added - to_plane[:3, 3]) @ to_plane[:3, :3]

@@ -5,15 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cli_support import complaint
+from cli_support import answer, complaint
 from emulator.core.errors import InputError
 from emulator.geometry.facets import Cavity
 from emulator.geometry.generators.biventricle import biventricle
 from emulator.geometry.generators.ellipsoid import HUMAN
+from emulator.hearts.checks import mirrored
 from emulator.hearts.heart import mesh_wall
 from emulator.hearts.joints import zipped
 from emulator.hearts.remeshing import Unmeshable, triangulate
-from emulator.hearts.surfaces import Surface, clipped, rim_loops, surface
+from emulator.hearts.surfaces import Surface, clipped, read_surface, rim_loops, surface
 from emulator.scenes.draft import draft_scene
 from emulator.scenes.fibre_rules import Biventricle
 from surface_support import write
@@ -231,3 +232,44 @@ def test_every_frame_of_a_real_heart_is_meshed(measured):
         walls.append(found.wall[0])
     # Muscle keeps its volume; the surfaces were fitted to images, each frame by itself.
     assert np.ptp(walls) < 0.25 * np.mean(walls)
+
+
+def test_two_endocardia_that_are_swapped_are_refused(flat, tmp_path, capsys):
+    left, right, outer = (
+        write(tmp_path / f"{each.name}.stl", each.points[each.triangles]) for each in flat
+    )
+    words = ["mesh", "--endocardium", right, "--right", left, "--epicardium", outer]
+    for more in ([], ["--ventricles", "left"]):
+        line = complaint(capsys, *map(str, [*words, *more, "--out", tmp_path / "heart.vtu"]))
+        assert (
+            "lv_endocardium and rv_endocardium are swapped: the left ventricle is the round" in line
+        )
+
+
+def test_valves_tell_a_mirrored_heart(measured):
+    folder = measured / "human_heart"
+    for frame in FRAMES:
+        surfaces = [
+            read_surface(folder / f"{name}_{frame:03d}.obj", name)
+            for name in ("LV_ENDOCARDIAL", "RV_ENDOCARDIAL", "EPICARDIAL")
+        ]
+        assert not list(mirrored(surfaces))
+        turned = [surface(s.name, s.points * [-1.0, 1.0, 1.0], s.triangles) for s in surfaces]
+        (line,) = mirrored(turned)
+        assert "as in a mirrored heart, whose fibres by rule have the wrong hand" in line
+
+
+def test_a_mirrored_heart_is_questioned_by_the_command(measured, tmp_path, capsys):
+    needs_gmsh()
+    words = ["mesh", "--out", tmp_path / "heart.vtu"]
+    for option, name in (
+        ("--endocardium", "LV_ENDOCARDIAL"),
+        ("--right", "RV_ENDOCARDIAL"),
+        ("--epicardium", "EPICARDIAL"),
+    ):
+        original = read_surface(measured / "human_heart" / f"{name}_018.obj", name)
+        mirror = original.points * [1.0, -1.0, 1.0]
+        words += [option, write(tmp_path / f"{name}.stl", mirror[original.triangles])]
+    code, told = answer(capsys, *words)
+    assert code == 0
+    assert ["mirrored heart" in line for line in told["warnings"]] == [True]

@@ -164,5 +164,5 @@ def _measured(data: Mapping[str, Any], out: str, doubts: list[str]) -> Answer:
         result[name] = of
         rows.append((name, f"{of['mean']:.4g}", f"{of['sd']:.3g}", of["missing"]))
     text = table(("data", "mean (mm, mL, N)", "sd", "missing"), rows)
-    result = {"out": out, "data": result, "warnings": doubts}
-    return Answer(result, "\n".join([text, *doubts, f"written to {out}"]))
+    lines = [text, *doubts, f"written to {out}"]
+    return Answer({"out": out, "data": result, "warnings": doubts}, "\n".join(lines))
