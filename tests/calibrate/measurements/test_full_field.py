@@ -185,7 +185,10 @@ def test_matrices_of_different_shapes_are_refused(tmp_path):
 def pulled(parameter="pull", y=True):
     """A block between x = 0 and 4, pulled along x, and along y too."""
     supports = (
-        Support("left"),
+        *(
+            Support(name, components=c)
+            for name, c in zip(("left", "front", "bottom"), "xyz", strict=True)
+        ),
         Support("right", (1.0, 0.0, 0.0), "x", amount=parameter),
         *([Support("back", (0.0, 2.0, 0.0), "y", amount=parameter)] if y else []),
     )
