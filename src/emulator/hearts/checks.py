@@ -105,7 +105,8 @@ def roundness(surface: Surface) -> float:
 def _free_wall(surface: Surface, other: Surface, outer: Surface) -> float:
     """Return the median thickness in mm of the wall that is not the septum."""
     ways = distances(surface.points, [outer])
-    return float(np.median(ways[ways < distances(surface.points, [other])]))
+    free = ways[ways < distances(surface.points, [other])]
+    return float(np.median(free)) if len(free) else 0.0
 
 
 def mirrored(surfaces: Sequence[Surface]) -> Iterator[str]:

@@ -115,8 +115,8 @@ def mesh_wall(
     _check_options(order, unit, smooth, least, ventricles, right)
     sources = [(endocardium, BOTH[0]), (right, BOTH[1]), (epicardium, BOTH[2])]
     read = [surface_in_mm(source, name, unit) for source, name in sources if source is not None]
-    intact, plane, notes = _walls(read, Plane(axis, base_height, base_point), ventricles)
-    both, is_cut = len(intact) == 3, plane != Plane()
+    intact, plane, notes = _walls(read, BasePlane(axis, base_height, base_point), ventricles)
+    both, is_cut = len(intact) == 3, plane != BasePlane()
     base = _below(intact, plane) if is_cut or not both else _at_valves(intact)
     *inner, outer = (smoothed(surface, smooth) for surface in base.surfaces)
     check_places([*inner, outer])
@@ -143,7 +143,7 @@ def mesh_wall(
     return replace(wall, warnings=(*notes, *doubts(wall, volumes)))
 
 
-class Plane(NamedTuple):
+class BasePlane(NamedTuple):
     """The base plane as far as it is known: axis, height along it, or a point."""
 
     axis: Sequence[float] | None = None
@@ -152,8 +152,8 @@ class Plane(NamedTuple):
 
 
 def _walls(
-    surfaces: list[Surface], plane: Plane, ventricles: str | None
-) -> tuple[list[Surface], Plane, list[str]]:
+    surfaces: list[Surface], plane: BasePlane, ventricles: str | None
+) -> tuple[list[Surface], BasePlane, list[str]]:
     """Return the surfaces that walls are between, the epicardium last, the base plane, and notes.
 
     surfaces : the surfaces that were read: endocardium, or both, and epicardium.
@@ -165,7 +165,7 @@ def _walls(
     elif _are_one(*surfaces):
         surfaces, axis = split_muscle(replace(surfaces[0], name="the muscle"), *plane)
         at = round(float((surfaces[-1].points @ axis).max()), 6) + 0.0
-        plane = Plane(axis.tolist())
+        plane = BasePlane(axis.tolist())
         notes.append(
             f"one closed surface has both walls: split at {at:.4g} mm along the axis "
             f"{place_of(axis)}, where it falls into {len(surfaces)} surfaces"
@@ -179,7 +179,7 @@ def _walls(
     left = left_wall(inner, outer, right[0])
     if plane.axis is None:
         at_all = plane.height is not None or plane.point is not None
-        plane = Plane(left.axis.tolist(), plane.height if at_all else left.height, plane.point)
+        plane = BasePlane(left.axis.tolist(), plane.height if at_all else left.height, plane.point)
     return [inner, left.outside], plane, notes
 
 
@@ -224,7 +224,7 @@ def _at_valves(surfaces: list[Surface]) -> Base:
     return Base(surfaces, axis_to_rims(surfaces[0]), (0.0, 0.0))
 
 
-def _below(surfaces: Sequence[Surface], plane: Plane) -> Base:
+def _below(surfaces: Sequence[Surface], plane: BasePlane) -> Base:
     """Return what is below the base plane of surfaces, the epicardium last."""
     normal, point = _place(surfaces, plane)
     below, outer = [cut(surface, point, normal) for surface in surfaces], surfaces[-1]
@@ -242,7 +242,7 @@ def _below(surfaces: Sequence[Surface], plane: Plane) -> Base:
     return Base(below, normal, (above, (outer.volume - below[-1].volume) / MM3_PER_ML))
 
 
-def _place(surfaces: Sequence[Surface], plane: Plane) -> tuple[np.ndarray, np.ndarray]:
+def _place(surfaces: Sequence[Surface], plane: BasePlane) -> tuple[np.ndarray, np.ndarray]:
     """Return the normal (3,) and a point (3,) of the base plane."""
     axis, height, point = plane
     if height is not None and point is not None:
