@@ -196,8 +196,10 @@ def _check_options(
     if order not in (1, 2):
         raise InputError(f"order {order}: expected 1 or 2")
     look_up(IN_MM, unit, "unit")
-    if smooth < 0 or not least > 0.0:
-        raise InputError(f"smooth {smooth}, least {least} mm: expected 0 times or more, above 0 mm")
+    if smooth < 0:
+        raise InputError(f"smooth {smooth}: expected 0 times or more")
+    if not least > 0.0:
+        raise InputError(f"least {least} mm: expected a thickness above 0 mm")
     if ventricles is not None:
         look_up(dict.fromkeys(VENTRICLES), ventricles, "ventricles")
         if right is None:

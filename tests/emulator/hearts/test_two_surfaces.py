@@ -207,7 +207,7 @@ def cut_open(path):
 
 WRONG = {
     "swapped": (lambda a, b: ((b, a), {}), "endocardium and epicardium are swapped"),
-    "crossing": (lambda a, b: ((moved(a, [15, 0, 0]), b), {}), r"endocardium crosses epicardium: \d+ of its"),
+    "crossing": (lambda a, b: ((moved(a, [15, 0, 0]), b), {}), r"(endo|epi)cardium crosses (endo|epi)cardium: \d+ of its"),
     "apart": (lambda a, b: ((moved(a, [90, 0, 0]), b), {}), "endocardium lies outside of epicardium"),
     "metres": (lambda a, b: ((a, b), {"unit": "mm"}), r"endocardium: it is 0\.\d+ mm from corner to corner"),
     "hole": (lambda a, b: ((with_hole(a), b), {}), r"endocardium: it has 2 openings, the smallest of .* --base-height"),
