@@ -90,7 +90,7 @@ def joints_of(surfaces: Sequence[Surface]) -> dict[str, Joint]:
             ways = [tree.query(rim)[0].mean() for tree in trees]
             closest = int(np.argmin(ways))
             radius = np.sqrt(np.linalg.norm(area_vector(rim)) / np.pi)
-            if ways[closest] > _ASTRAY * radius:
+            if len(surfaces) > 2 and ways[closest] > _ASTRAY * radius:
                 raise InputError(
                     f"{surface.name}: no opening of the epicardium is at its opening around "
                     f"{place_of(rim.mean(axis=0))}; the nearest is {ways[closest]:.3g} mm away"
