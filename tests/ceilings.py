@@ -182,7 +182,7 @@ FIGURES: dict[str, tuple[int, Callable[[], list[str]]]] = {
     "files that weight points": (5, weighted_points),
     "files that solve dense systems": (19, dense_solves),
     "members of Observation": (11, observation_members),
-    "public names": (144, public_names),
+    "public names": (143, public_names),
     "deep imports of studies": (565, deep_imports_of_studies),
     "files of the spine": (43, spine),
     "lines of the spine": (10_715, lines_of_spine),

@@ -29,6 +29,7 @@ ROOMS = {
         "calibrate.project.specimen",
     ),
     "fields": (
+        "calibrate.measurements.frame_checks",
         "calibrate.measurements.frames",
         "calibrate.measurements.full_field",
         "calibrate.cli.commands.frames",

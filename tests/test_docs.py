@@ -91,7 +91,7 @@ PAGES = sorted(
     and (page := f"docs/{path.name}") not in OWN_TESTS
 )
 NEED_MORE = {
-    "mesh_heart", "mesh_sheet", "mesh_wall", "read_full_field", "regions_within", "released_network",
+    "mesh_sheet", "mesh_wall", "read_full_field", "regions_within", "released_network",
 }  # fmt: skip
 """Functions that need Gmsh or released data; pages show a call that does not run here."""
 

@@ -16,9 +16,8 @@ from .geometry.io import Body, read_body, read_mesh, write_mesh, write_solution
 from .geometry.mesh import Mesh, boundary_facets
 from .geometry.random_field import matern_modes
 from .geometry.side_by_side import Bodies, side_by_side
-from .hearts.heart import mesh_heart
+from .hearts.heart import mesh_wall
 from .hearts.sheet import mesh_sheet, regions_within
-from .hearts.two_surfaces import mesh_wall
 from .mechanics import laws
 from .mechanics.laws import find_law
 from .scenes import Parameter, Scene, Support, loads, supports
@@ -80,7 +79,6 @@ __all__ = [
     "loads",
     "matern_modes",
     "mesh_error",
-    "mesh_heart",
     "mesh_sheet",
     "mesh_wall",
     "potential_energy",

@@ -13,8 +13,8 @@ from studies.any_ventricle.shapes import USUAL, Body, bodies
 
 from emulator.geometry.facets import flat_triangles
 from emulator.geometry.mesh import Mesh
+from emulator.hearts.heart import Wall, mesh_wall
 from emulator.hearts.surfaces import Surface
-from emulator.hearts.two_surfaces import Wall, mesh_wall
 from emulator.scenes.built_in.ventricles import MYOCARDIUM, PRESSURE
 from emulator.scenes.fibre_rules import Helix
 from emulator.scenes.scene import Scene
@@ -48,7 +48,7 @@ def human(frame: str) -> Scene:
     """The left ventricle of the measured heart, its surfaces of ``frame`` taken as at rest."""
     names = ("LV_ENDOCARDIAL", "EPICARDIAL", "RV_ENDOCARDIAL")
     inner, outer, right = (HEART / f"{name}_{frame}.obj" for name in names)
-    return _scene("human", mesh_wall(inner, outer, right=right), (60.0, -60.0))
+    return _scene("human", mesh_wall(inner, outer, right=right, ventricles="left"), (60.0, -60.0))
 
 
 def meshed_by_gmsh(body: Body) -> Scene:

@@ -126,9 +126,9 @@ def scene_of(data: Path, folder: Path, assumed: Assumed = AS_IMAGED) -> Scene:
     if not path.is_file():
         left, right, outside = surfaces_of(data, IMAGED).values()
         if assumed.both:
-            wall = em.mesh_heart(left, right, outside, size=_SIZE)
+            wall = em.mesh_wall(left, outside, right=right, size=_SIZE)
         else:
-            wall = em.mesh_wall(left, outside, right=right, size=_LEFT_SIZE)
+            wall = em.mesh_wall(left, outside, right=right, ventricles="left", size=_LEFT_SIZE)
         write_mesh(folder / "heart.vtu", wall.mesh)
         path.write_text(_scene_file(assumed, [float(x) for x in wall.axis]))
     return em.find_scene(str(path))

@@ -123,24 +123,20 @@ def along_normals(
         where they point into it: walls on the other side of a cavity do not count. 0 for what most
         of the nearest triangles say.
     """
-    a, b, c = np.moveaxis(surface.points[surface.triangles], 1, 0)
-    area = np.cross(b - a, c - a)
-    unit = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-300)
-    ways, cosines = np.full((2, len(points), len(a)), np.nan)
-    for k, (x, n) in enumerate(zip(points, normals, strict=True)):
-        turned = unit @ n
-        steep = np.abs(turned) > _STEEP
-        s = np.einsum("ti,ti->t", a - x, unit) / np.where(steep, turned, 1.0)
-        at = x + s[:, None] * n
-        inside = steep & (np.abs(s) <= reach)
-        for start, end in ((a, b), (b, c), (c, a)):
-            inside &= np.einsum("ti,ti->t", np.cross(end - start, at - start), area) >= 0.0
-        ways[k, inside], cosines[k, inside] = s[inside], turned[inside]
-    rows = np.arange(len(points))
+    count = len(points)
+    places, row, triangle = surface.mesh.ray.intersects_location(
+        np.tile(points, (2, 1)), np.vstack([normals, -normals])
+    )
+    places, row = places.reshape(-1, 3), row % count
+    ways = np.einsum("ki,ki->k", places - points[row], normals[row])
+    cosines = np.einsum("ki,ki->k", surface.mesh.face_normals[triangle], normals[row])
+    meets = (np.abs(ways) <= reach) & (np.abs(cosines) > _STEEP)
+    order = np.argsort(-np.abs(ways))  # the nearest comes last, and stays
 
-    def nearest() -> np.ndarray:
-        return np.argmin(np.where(np.isnan(ways), np.inf, np.abs(ways)), axis=1)
+    def nearest(values: np.ndarray, of: np.ndarray) -> np.ndarray:
+        result, last = np.full(count, np.nan), order[of[order]]
+        result[row[last]] = values[last]
+        return result
 
-    side = outward or np.sign(np.nansum(np.sign(cosines[rows, nearest()])))
-    ways[~(side * cosines > 0.0)] = np.nan
-    return ways[rows, nearest()]
+    side = outward or np.sign(np.nansum(np.sign(nearest(cosines, meets))))
+    return nearest(ways, meets & (side * cosines > 0.0))

@@ -13,11 +13,12 @@ a point and a column a frame. Lengths are in mm.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from calibrate.measurements.collection import Observations, observations
 from calibrate.measurements.displacements import Landmarks
@@ -25,11 +26,16 @@ from calibrate.state_names import in_state
 from emulator.core.cells import Cells, read_cells
 from emulator.core.errors import InputError
 from emulator.scenes.scene import Scene
+from emulator.scenes.supports import Support
 from emulator.specimens.states import falls
 
 _FOLLOWS = (
     0.9  # correlation of the points' mean motion with what pulls them, where frames are right
 )
+_ONE_PLACE = 1e-3  # of the usual distance: points nearer to each other are one
+_FARTHER = 3.0  # times what pulls the body: its points do not move more
+_AGAINST = -0.1  # of the pull: the points' mean motion does not go against it
+_ASIDE = 0.2  # of the strain along a pull: a body does not grow more across it
 _MATRICES = ("x", "y", "ux", "uy")
 
 
@@ -56,6 +62,15 @@ class FullField:
             )
         if not np.isfinite(self.points).all() or np.isinf(self.displacement).any():
             raise InputError("full field: a place is not finite, or a displacement is infinite")
+        if len(self.points) > 1:
+            ways, others = cKDTree(self.points).query(self.points, k=2)
+            row = int(np.argmin(ways[:, 1]))
+            if ways[row, 1] < _ONE_PLACE * np.median(ways[:, 1]):
+                raise InputError(
+                    f"full field: points {row + 1} and {others[row, 1] + 1} are "
+                    f"{ways[row, 1]:.2g} mm apart, of {np.median(ways[:, 1]):.2g} usually: one "
+                    "place counts once"
+                )
 
     def only(self, frames: Sequence[str], points: np.ndarray | None = None) -> FullField:
         """Return the field of some frames, in this order, and of the points with these numbers.
@@ -250,10 +265,11 @@ def measured_field(
     *,
     frames: Sequence[str] | None = None,
     points: int = 60,
-) -> tuple[Observations, dict[str, np.ndarray], dict[str, float]]:
-    """Return the observations of a full field and of forces beside it, their data, and amounts.
+) -> tuple[Observations, dict[str, np.ndarray], dict[str, float], list[str]]:
+    """Return the observations of a full field and of forces beside it, data, amounts, and doubts.
 
-    Amounts are those of the parameter that pulls the body, by ``parameter@frame``.
+    Amounts are those of the parameter that pulls the body, by ``parameter@frame``; a doubt is a
+    sentence on what contradicts itself.
 
     Parameters
     ----------
@@ -296,7 +312,8 @@ def measured_field(
             parts[in_state(name, frame)] = part
             data[in_state(name, frame)] = np.array(np.interp(amounts[frame], at, forces_at))
     known = {in_state(parameter, frame): amounts[frame] for frame in field.frames}
-    return observations(parts), data, known
+    doubts = [*field_doubts(scene, field, amounts, parameter)]
+    return observations(parts), data, known, doubts
 
 
 def field_data(
@@ -331,6 +348,54 @@ def field_data(
         for frame, u in zip(field.frames, field.displacement, strict=True)
     }
     return observations(dict.fromkeys(data, part)), data
+
+
+def field_doubts(
+    scene: Scene, field: FullField, amounts: Mapping[str, float], parameter: str
+) -> Iterator[str]:
+    """Yield a sentence for each doubt about a full field beside the supports that pull the body.
+
+    parameter : what the ``amounts`` are of.
+    """
+    pulling = [
+        np.atleast_2d(support.displacement)
+        for support in scene.supports
+        if isinstance(support, Support) and support.amount == parameter
+    ]
+    pulls = np.array([d[np.argmax(np.linalg.norm(d, axis=1))] for d in pulling]).reshape(-1, 3)[
+        :, :2
+    ]
+    last = int(np.argmax([abs(amounts[frame]) for frame in field.frames]))
+    amount, u = amounts[field.frames[last]], field.displacement[last]
+    seen = np.isfinite(u).all(axis=1)
+    if not pulls.any() or amount == 0.0 or seen.sum() < 4:
+        return
+    most = abs(amount) * np.linalg.norm(pulls, axis=1).max()
+    far = float(np.quantile(np.linalg.norm(u[seen], axis=1), 0.95))
+    if far > _FARTHER * most:
+        yield (
+            f"points of frame '{field.frames[last]}' move by {far:.3g}, what pulls them by "
+            f"{most:.3g} mm: are displacements in mm, not in pixels?"
+        )
+    for k, axis in enumerate("xy"):
+        pull = pulls[:, k].sum()
+        if pull and (pulls[:, k] * pull >= 0.0).all():
+            share = u[seen, k].mean() / (amount * np.abs(pulls[:, k]).max() * np.sign(pull))
+            if share < _AGAINST:
+                yield (
+                    f"points of frame '{field.frames[last]}' move against the pull along {axis}: "
+                    f"does {axis} of the image point the other way (rows count down)?"
+                )
+    if (along := np.flatnonzero(pulls.any(axis=0))).size == 1:
+        x = field.points[seen] - field.points[seen].mean(axis=0)
+        gradient = np.linalg.pinv(x) @ (u[seen] - u[seen].mean(axis=0))
+        stretch, aside = gradient[along[0], along[0]], gradient[1 - along[0], 1 - along[0]]
+        if stretch > 0.0 and aside > _ASIDE * stretch:
+            yield (
+                f"points of frame '{field.frames[last]}' part by {100 * aside:.2g} % across the "
+                f"pull, by {100 * stretch:.2g} % along it: does {'yx'[along[0]]} of the image "
+                "point the other way (rows count down)?"
+            )
 
 
 def _check_order(field: FullField, amounts: np.ndarray) -> None:

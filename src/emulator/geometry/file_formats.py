@@ -36,15 +36,18 @@ _FACES = {"S1": (0, 1, 2), "S2": (0, 3, 1), "S3": (1, 3, 2), "S4": (2, 3, 0)}
 _TYPES = {"C3D4H": "tetra", "C3D4T": "tetra", "C3D10HS": "tetra10", "M3D3": "triangle"}
 
 
-def read_cells(path: Path) -> meshio.Mesh:
-    """Return the content of a file as meshio has it; :class:`InputError` where it cannot."""
+def read_cells(path: Path, reader: Callable[[Path], meshio.Mesh] | None = None) -> meshio.Mesh:
+    """Return the content of a file as meshio has it; :class:`InputError` where it cannot.
+
+    reader : the reader of the file's format; by default meshio's.
+    """
     if not path.is_file():
         what = "is a folder; name a file in it" if path.is_dir() else "does not exist"
         raise InputError(f"mesh file {path} {what}")
     if not path.stat().st_size:
         raise InputError(f"mesh file {path} is empty")
     try:
-        return _reader(path)(path)
+        return (reader or _reader(path))(path)
     except Exception as error:  # meshio's readers raise many types
         unknown = f"{error.args[0]} is not defined" if isinstance(error, KeyError) else ""
         reason = unknown or " ".join(str(error).split())[:160] or type(error).__name__

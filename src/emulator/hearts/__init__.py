@@ -1,7 +1,8 @@
 """A room: hearts and sheets from surfaces and outlines, meshed by Gmsh.
 
 :mod:`.surfaces` reads and cuts closed and open surfaces, :mod:`.remeshing` makes their triangles
-even, :mod:`.wall` fills what is between surfaces and measures it. :mod:`.two_surfaces` makes a left
-ventricle, :mod:`.heart` both ventricles, :mod:`.left_wall` the left one's part of both, and
-:mod:`.sheet` a body from outlines in a plane.
+even. :mod:`.heart` makes the walls of a left ventricle or of both, from :mod:`.joints` between
+surfaces, :mod:`.wall`, which fills and measures what is between them, and :mod:`.checks`.
+:mod:`.left_wall` cuts the left ventricle's part from both, and :mod:`.sheet` makes a body from
+outlines in a plane.
 """

@@ -19,15 +19,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_array, diags_array
-from scipy.spatial import cKDTree
 
 from emulator.core.errors import InputError
-from emulator.geometry.mesh import SIDES
-from emulator.hearts.surfaces import Surface, axis_to_rims, sampled
+from emulator.hearts.surfaces import Surface, axis_to_rims, nearest, neighbour_means
 
 _FARTHEST = 1.3  # times the nearest distance
-_STEPS, _MET = 30, 0.05  # of the search along a normal, and the gap over the thickness that ends it
 _EVEN = 20  # passes that smooth normals and distances
 _THIN = 0.5  # thickness over the median of what is left of the wall at its base
 _FAR = 3.0  # median thickness over which the others are not around the endocardium, of its extent
@@ -63,39 +59,28 @@ def left_wall(endocardium: Surface, epicardium: Surface, right: Surface) -> Left
         )
     edges = np.concatenate(rims)
     axis = axis_to_rims(endocardium)
-    heights = endocardium.points @ axis
-    mean, normals = _neighbours(endocardium), endocardium.normals
+    points, around = endocardium.points, (epicardium, right)
+    heights, edges_of = points @ axis, endocardium.mesh.edges
+    selves = np.repeat(np.arange(len(points))[:, None], 2, axis=1)
+    mean = neighbour_means(np.vstack([edges_of, edges_of[:, ::-1], selves]), len(points))
+    normals = endocardium.mesh.vertex_normals
     for _ in range(_EVEN):
         normals = mean @ normals
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    others = np.vstack([epicardium.points, right.points])
-    median = float(np.median(cKDTree(others).query(endocardium.points)[0]))
-    if _FAR * median > endocardium.extent:
+    farthest = _FARTHEST * nearest(around, points)[1]
+    if _FAR * (median := float(np.median(farthest)) / _FARTHEST) > endocardium.extent:
         raise InputError(
             f"the epicardium and the right ventricle are {median:.3g} mm away from the left "
             f"endocardium, of {endocardium.extent:.3g} mm: are they of one heart, in one unit?"
         )
-    around = [sampled(surface, surface.points, _MET * median) for surface in (epicardium, right)]
-    tree = cKDTree(np.vstack(around), balanced_tree=False)
-    nearest = tree.query(endocardium.points)[0]
-    ways = nearest.copy()
-    for _ in range(_STEPS):  # a step of the distance to a surface never crosses it
-        gap = tree.query(endocardium.points + ways[:, None] * normals)[0]
-        going = (gap > _MET * nearest) & (ways < _FARTHEST * nearest)
-        ways = np.where(going, ways + gap, ways)
-    ways = np.minimum(ways, _FARTHEST * nearest)
+    ways = np.full(len(points), np.inf)
+    for other in around:
+        places, row, _ = other.mesh.ray.intersects_location(points, normals)
+        np.minimum.at(ways, row, np.linalg.norm(places - points[row], axis=1))
+    ways = np.where(np.isfinite(ways), np.minimum(ways, farthest), farthest / _FARTHEST)
     for _ in range(_EVEN):
-        ways = np.minimum(mean @ ways, _FARTHEST * nearest)
-    outside = endocardium.points + ways[:, None] * normals
+        ways = np.minimum(mean @ ways, farthest)
+    outside = points + ways[:, None] * normals
     thin = (ways < _THIN * np.median(ways)) & (heights > heights.mean())
     low = min(heights[edges].min(), heights[thin].min(initial=np.inf))
     return LeftWall(Surface("epicardium", outside, endocardium.triangles), axis, float(low))
-
-
-def _neighbours(surface: Surface) -> coo_array:
-    """Return the matrix (n, n) that takes the mean over each point and its neighbours."""
-    edges = surface.triangles[:, SIDES].reshape(-1, 2)
-    count = len(surface.points)
-    pairs = np.vstack([edges, edges[:, ::-1], np.repeat(np.arange(count)[:, None], 2, axis=1)])
-    graph = (coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count)) > 0).astype(float)
-    return diags_array(1.0 / graph.sum(axis=1)) @ graph

@@ -32,7 +32,7 @@ from scipy.spatial import cKDTree
 
 from emulator.core.errors import InputError
 from emulator.geometry.mesh import cross_sides
-from emulator.hearts.surfaces import Surface, closed, rim_loops, signed_areas
+from emulator.hearts.surfaces import Surface, closed, rim_loops
 
 _TYPES = {3: 2, 4: 4}  # Gmsh's numbers of element types, by their corners
 
@@ -284,7 +284,7 @@ class DiscMap:
         on_rims = [rim.at(turn) for rim, turn in zip(self.rims, turns, strict=True)]
         points[: sum(counts)] = np.concatenate(on_rims)
         now, before = (
-            np.sign(np.sum(signed_areas(corners)))
+            np.sign(np.sum(_signed_areas(corners)))
             for corners in (places[rows], self.places[self.surface.triangles])
         )
         rows = rows if now == before else rows[:, ::-1]
@@ -304,7 +304,7 @@ class DiscMap:
         on_surface = 0.5 * np.linalg.norm(cross_sides(self.surface.points[rows]), axis=1)
         areas = [
             np.bincount(rows.ravel(), np.repeat(area, 3), len(self.places))
-            for area in (on_surface, np.abs(signed_areas(self.places[rows])))
+            for area in (on_surface, np.abs(_signed_areas(self.places[rows])))
         ]
         # Areas over two rings of neighbours, because rough surfaces have upright triangles.
         around = [np.bincount(rows.ravel(), area[rows].sum(1).repeat(3)) for area in areas]
@@ -349,3 +349,9 @@ def _mean_value_weights(surface: Surface) -> coo_array:
         values += [half / p, half / q]
     places = (np.concatenate(first), np.concatenate(last))
     return coo_array((np.concatenate(values), places), shape=(len(x), len(x))).tocsr()
+
+
+def _signed_areas(corners: np.ndarray) -> np.ndarray:
+    """Return the areas (t,) of triangles (t, 3, 2) in the plane, positive anticlockwise."""
+    (ux, uy), (vx, vy) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
+    return 0.5 * (ux * vy - uy * vx)

@@ -1,8 +1,8 @@
 r"""Surfaces of triangles: reading, checks, cuts by a plane, smoothing, tests of enclosure.
 
-A surface is closed, or open with a rim or several. What a segmentation gives is rough: Taubin's
-filter moves each point to the mean of its neighbours by a fraction :math:`\lambda` and back by
-:math:`\mu`,
+A surface is closed, or open with a rim or several. Files, normals, rays and nearest points are by
+trimesh (extra ``surfaces``). What a segmentation gives is rough: Taubin's filter moves each point
+to the mean of its neighbours by a fraction :math:`\lambda` and back by :math:`\mu`,
 
 .. math:: x \leftarrow (1 + \mu L)(1 + \lambda L)\, x, \qquad \lambda > 0 > \mu, \quad
           |\mu| > \lambda,
@@ -15,8 +15,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
+import meshio
 import numpy as np
 from scipy.sparse import coo_array, diags_array
 from scipy.spatial import cKDTree
@@ -24,13 +26,27 @@ from scipy.spatial import cKDTree
 from emulator.core.errors import InputError
 from emulator.geometry.facets import enclosed_volume, openings
 from emulator.geometry.file_formats import read_cells
-from emulator.geometry.mesh import SIDES, parts
+from emulator.geometry.mesh import parts
+
+try:
+    import rtree  # noqa: F401, trimesh looks for nearest triangles by it
+    from trimesh import Trimesh, load_mesh
+    from trimesh.grouping import group_rows
+    from trimesh.proximity import closest_point
+    from trimesh.smoothing import filter_taubin
+    from trimesh.triangles import points_to_barycentric
+except ModuleNotFoundError as error:
+    raise InputError(
+        "surfaces need trimesh: pip install 'soft-tissue-calibrate[surfaces]'"
+    ) from error
 
 _MERGE = 1e-6  # distance over the extent below which points are merged
 _SNAP = 1e-4  # of the extent: points this near a plane lie in it, so that no slivers are cut off
 # Taubin's filter: halves what repeats every five edges and keeps what repeats every twenty.
-_LAMBDA, _MU = 0.5, -0.53
-_TILT = 0.01
+_LAMBDA, _MU = 0.5, 0.53
+_RAY = np.array([0.00618, 0.00733, 1.0])  # tilted against any grid, so that it meets no edge
+_CHUNK = 1000  # points whose nearest triangles are looked for together, which takes memory
+_FORMATS = (".stl", ".ply", ".obj", ".off")  # which trimesh reads; the others are meshio's
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,31 +60,29 @@ class Surface:
     points: np.ndarray
     triangles: np.ndarray
 
+    @cached_property
+    def mesh(self) -> Trimesh:
+        """The triangles with their normals, areas and rays."""
+        return Trimesh(self.points, self.triangles, process=False)
+
+    def nearest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the nearest point (k, 3) mm, the distance (k,) mm and the unit normal there."""
+        places, ways, rows = closest_point(self.mesh, points)
+        weights = points_to_barycentric(self.mesh.triangles[rows], places)
+        normals = self.mesh.vertex_normals[self.triangles[rows]]
+        return places, ways, np.einsum("ka,kai->ki", weights, normals)
+
     @property
     def extent(self) -> float:
         """Diagonal of the bounding box, mm."""
         return float(np.linalg.norm(np.ptp(self.points, axis=0)))
 
-    @property
+    @cached_property
     def rims(self) -> list[np.ndarray]:
         """Edges (e, 2) of each opening."""
         return openings(self.triangles)
 
-    @property
-    def normals(self) -> np.ndarray:
-        """Unit normals (n, 3) at the points, pointing out: the mean of the triangles' by area."""
-        a, b, c = np.moveaxis(self.points[self.triangles], 1, 0)
-        sums = np.zeros_like(self.points)
-        np.add.at(sums, self.triangles, np.cross(b - a, c - a)[:, None])
-        return sums / np.linalg.norm(sums, axis=1, keepdims=True)
-
-    @property
-    def area(self) -> float:
-        """Area of the triangles, mm2."""
-        a, b, c = np.moveaxis(self.points[self.triangles], 1, 0)
-        return 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-
-    @property
+    @cached_property
     def volume(self) -> float:
         """Enclosed with flat lids, mm3."""
         middle = self.points - self.points.mean(axis=0)
@@ -77,13 +91,14 @@ class Surface:
 
 
 def read_surface(path: str | Path, name: str, scale: float = 1.0) -> Surface:
-    """Return a surface from STL, PLY, OBJ or another file of triangles that meshio reads.
+    """Return a surface from STL, PLY, OBJ, OFF or another file of triangles that meshio reads.
 
     :class:`InputError` as of :func:`surface`, or for a file that cannot be read or has other cells.
 
     name : the name of the surface in messages. scale : mm in one unit of the file.
     """
-    content = read_cells(Path(path))
+    by_trimesh = Path(path).suffix.lower() in _FORMATS
+    content = read_cells(Path(path), _read_triangles if by_trimesh else None)
     kinds = sorted({block.type for block in content.cells if len(block.data)})
     if "triangle" not in kinds or set(kinds) - {"triangle", "line", "vertex"}:
         raise InputError(
@@ -92,6 +107,12 @@ def read_surface(path: str | Path, name: str, scale: float = 1.0) -> Surface:
         )
     points = scale * np.asarray(content.points, dtype=float)
     return surface(name, points, content.get_cells_type("triangle"))
+
+
+def _read_triangles(path: Path) -> meshio.Mesh:
+    """Return the triangles of a file, its polygons cut into triangles."""
+    mesh = load_mesh(path, process=False)
+    return meshio.Mesh(mesh.vertices, [("triangle", mesh.faces)])
 
 
 def surface(name: str, points: np.ndarray, triangles: np.ndarray) -> Surface:
@@ -131,19 +152,15 @@ def _merge_points(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray
 
 def _orient_consistently(name: str, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Return the triangles turned so that neighbours list a common edge in opposite senses."""
-    edges = triangles[:, SIDES].reshape(-1, 2)
-    owner = np.repeat(np.arange(len(triangles)), 3)
-    ends = np.sort(edges, axis=1)
-    order = np.lexsort(ends.T[::-1])
-    same = (ends[order][1:] == ends[order][:-1]).all(axis=1)
-    if (thrice := same[1:] & same[:-1]).any():
-        position = place_of(points[edges[order[1:-1][thrice][0]]].mean(axis=0))
+    mesh, count = Trimesh(points, triangles, process=False), len(triangles)
+    edges, owner = mesh.edges, mesh.edges_face
+    if (thrice := np.bincount(mesh.edges_unique_inverse) > 2).any():
+        position = place_of(points[mesh.edges_unique[thrice][0]].mean(axis=0))
         raise InputError(
             f"{name}: more than two triangles meet at the edge at {position}; repair the surface"
         )
-    one, other = order[:-1][same], order[1:][same]
+    one, other = group_rows(mesh.edges_sorted, require_count=2).T
     # Two copies of each triangle, one turned: neighbours that disagree join unlike copies.
-    count = len(triangles)
     copy = np.where(edges[one, 0] != edges[other, 0], 0, count)
     first = np.concatenate([owner[one], owner[one] + count])
     second = np.concatenate([owner[other] + copy, owner[other] + count - copy])
@@ -224,12 +241,16 @@ def one_rim(surface: Surface, is_cut: bool = False) -> np.ndarray:
     if not rims:
         raise InputError(
             f"{surface.name}: it is closed; give the base plane, a height along the long axis or a "
-            "point: --axis with --base-height or --base-point"
+            "point: --axis with --base-height or --base-point; one closed surface of the muscle, "
+            "with both walls, is given as endocardium and as epicardium"
         )
     small = surface.points[np.unique(rims[0])].mean(axis=0)
     remedy = "give a base plane below them, --base-height or --base-point, and --axis"
     if is_cut:
-        remedy = "lower the base plane, --base-height or --base-point, or turn --axis around"
+        remedy = (
+            "lower the base plane, --base-height or --base-point, or turn --axis around; one "
+            "surface with both walls is given as endocardium and as epicardium"
+        )
     raise InputError(
         f"{surface.name}: it has {len(rims)} openings, the smallest of {len(rims[0])} edges at "
         f"{place_of(small)}; expected the base's alone: fill the others, or {remedy}"
@@ -241,51 +262,54 @@ def smoothed(surface: Surface, times: int) -> Surface:
 
     A flat rim stays in its plane.
     """
-    count, rows = len(surface.points), surface.triangles
-    edges = rows[:, SIDES].reshape(-1, 2)
+    count, rims, edges = len(surface.points), surface.rims, surface.mesh.edges
     on_rim = np.zeros(count, dtype=bool)
-    rims = surface.rims
     for rim in rims:
         on_rim[rim] = True
     directed_edges = edges[~on_rim[edges[:, 0]]], edges[~on_rim[edges[:, 1]]][:, ::-1], *rims
-    pairs = np.concatenate([*directed_edges, *(rim[:, ::-1] for rim in rims)])
-    graph = (coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count)) > 0).astype(float)
-    mean = diags_array(1.0 / graph.sum(axis=1)) @ graph
-    x = surface.points
-    for factor in (_LAMBDA, _MU) * times:
-        x = x + factor * (mean @ x - x)
-    return Surface(surface.name, x, rows)
-
-
-def inside(surface: Surface, points: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """Return whether each of ``points`` (k, 3) mm is enclosed; the lid must be above them.
-
-    A ray from an enclosed point against ``axis`` (3,), away from the lid, crosses the surface an
-    odd number of times.
-    """
-    # Rays are tilted against any grid, so that they practically never meet an edge.
-    up = axis + _TILT * np.array([0.618, 0.733, 0.285])
-    up /= np.linalg.norm(up)
-    frame = np.stack([*axes_across(up), up], axis=1)
-    corners, at = surface.points[surface.triangles] @ frame, points @ frame
-    flat = corners[..., :2]
-    middle = flat.mean(axis=1)
-    reach = np.linalg.norm(flat - middle[:, None], axis=-1).max()
-    neighbours = cKDTree(middle, balanced_tree=False).query_ball_point(at[:, :2], 1.000001 * reach)
-    point = np.repeat(np.arange(len(at)), [len(candidates) for candidates in neighbours])
-    row = np.concatenate([np.asarray(candidates, dtype=np.int64) for candidates in neighbours])
-    # The areas between a ray and each side of the triangle, seen along the rays.
-    rays, opposite = at[point, None, :2], ((1, 2), (2, 0), (0, 1))
-    areas = np.stack(
-        [signed_areas(np.hstack([flat[row][:, side], rays])) for side in opposite], axis=1
+    mean = neighbour_means(
+        np.concatenate([*directed_edges, *(rim[:, ::-1] for rim in rims)]), count
     )
-    hits = (areas >= 0.0).all(axis=1) | (areas <= 0.0).all(axis=1)
-    total = areas.sum(axis=1)
-    hits &= total != 0.0
-    weights = areas[hits] / total[hits, None]
-    height = np.einsum("ka,ka->k", weights, corners[row[hits], :, 2])
-    below = height < at[point[hits], 2]
-    return np.bincount(point[hits][below], minlength=len(at)) % 2 == 1
+    smooth = filter_taubin(surface.mesh.copy(), _LAMBDA, _MU, 2 * times, mean)
+    return Surface(surface.name, np.array(smooth.vertices), surface.triangles)
+
+
+def neighbour_means(pairs: np.ndarray, count: int) -> coo_array:
+    """Return the matrix (n, n) that takes the mean over the second points of ``pairs`` (k, 2)."""
+    graph = (coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count)) > 0).astype(float)
+    return diags_array(1.0 / graph.sum(axis=1)) @ graph
+
+
+def inside(surface: Surface, points: np.ndarray) -> np.ndarray:
+    """Return whether each of ``points`` (k, 3) mm is within a surface and flat lids on its rims.
+
+    A ray from an enclosed point crosses the closed surface an odd number of times.
+    """
+    rays = np.broadcast_to(_RAY, points.shape)
+    _, crossing = closed(surface).mesh.ray.intersects_id(points, rays)
+    return np.bincount(crossing, minlength=len(points)) % 2 == 1
+
+
+def nearest(surfaces: Sequence[Surface], points: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return the nearest point (k, 3) of any surface, the way to it (k,) mm, and its normal."""
+    parts_of = [
+        [np.concatenate(values) for values in zip(*map(surface.nearest, chunks), strict=True)]
+        for chunks in [np.array_split(points, len(points) // _CHUNK + 1)]
+        for surface in surfaces
+    ]
+    places, ways, normals = (np.stack(values) for values in zip(*parts_of, strict=True))
+    rows = np.argmin(ways, axis=0), np.arange(len(points))
+    return places[rows], ways[rows], normals[rows]
+
+
+def distances(points: np.ndarray, around: Sequence[Surface]) -> np.ndarray:
+    """Return each point's distance (n,) mm to the nearest corner, middle or side of surfaces."""
+    places = []
+    for surface in around:
+        corners = surface.points[surface.triangles]
+        middles = 0.5 * (corners + np.roll(corners, 1, axis=1)).reshape(-1, 3)
+        places += [surface.points, corners.mean(axis=1), middles]
+    return cKDTree(np.vstack(places), balanced_tree=False).query(points)[0]
 
 
 def closed(surface: Surface, loops: Sequence[np.ndarray] | None = None) -> Surface:
@@ -336,26 +360,3 @@ def axis_to_rims(surface: Surface) -> np.ndarray:
     axis = np.sum([area_vector(rim) for rim in rims], axis=0)
     axis *= np.sign((np.concatenate(rims).mean(axis=0) - surface.points.mean(axis=0)) @ axis)
     return axis / np.linalg.norm(axis)
-
-
-def sampled(surface: Surface, values: np.ndarray, finest: float) -> np.ndarray:
-    """Return ``values`` (n, 3) of the points at places of each triangle, ``finest`` mm apart."""
-    corners = surface.points[surface.triangles]
-    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max()
-    count = max(int(np.ceil(longest / finest)), 1)
-    shares = [(i, j, count - i - j) for i in range(count + 1) for j in range(count + 1 - i)]
-    at_places = np.array(shares) / count
-    return np.einsum("qa,tai->tqi", at_places, values[surface.triangles]).reshape(-1, 3)
-
-
-def axes_across(normal: np.ndarray) -> np.ndarray:
-    """Return two unit vectors (2, 3) across the unit ``normal`` (3,) and each other."""
-    first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(normal, first)])
-
-
-def signed_areas(corners: np.ndarray) -> np.ndarray:
-    """Return the areas (t,) of triangles (t, 3, 2) in the plane, positive anticlockwise."""
-    (ux, uy), (vx, vy) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
-    return 0.5 * (ux * vy - uy * vx)

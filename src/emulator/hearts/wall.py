@@ -163,16 +163,6 @@ def surface_in_mm(source: str | Path | Surface, name: str, unit: str) -> Surface
     return surface
 
 
-def distances(points: np.ndarray, around: Sequence[Surface]) -> np.ndarray:
-    """Return each point's distance (n,) mm to the nearest corner, middle or side of surfaces."""
-    places = []
-    for surface in around:
-        corners = surface.points[surface.triangles]
-        middles = 0.5 * (corners + np.roll(corners, 1, axis=1)).reshape(-1, 3)
-        places += [surface.points, corners.mean(axis=1), middles]
-    return cKDTree(np.vstack(places), balanced_tree=False).query(points)[0]
-
-
 def thickness_of(ways: np.ndarray) -> Thickness:
     """Return the least, median and largest of distances (n,) mm."""
     return Thickness(float(ways.min()), float(np.median(ways)), float(ways.max()))

@@ -1,5 +1,6 @@
 """Tables of points over frames: three formats, what cannot be, and the data they become."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,13 +10,16 @@ import emulator as em  # noqa: F401 - float64
 from calibrate.measurements.full_field import (
     FullField,
     field_data,
+    field_doubts,
     read_amounts,
     read_curve,
     read_full_field,
     sign_of,
     spread_points,
 )
+from cli_support import answer
 from emulator.core.errors import InputError
+from emulator.scenes import Support
 from emulator.scenes.parameter_space import Parameter
 from scene_support import between_plates
 
@@ -176,3 +180,99 @@ def test_matrices_of_different_shapes_are_refused(tmp_path):
         np.savetxt(tmp_path / f"{name}.txt", np.ones((4, columns)))
     with pytest.raises(InputError, match=r"ux of shape \(4, 2\) and uy of \(4, 3\)"):
         read_full_field(tmp_path)
+
+
+def pulled(parameter="pull", y=True):
+    """A block between x = 0 and 4, pulled along x, and along y too."""
+    supports = (
+        *(
+            Support(name, components=c)
+            for name, c in zip(("left", "front", "bottom"), "xyz", strict=True)
+        ),
+        Support("right", (1.0, 0.0, 0.0), "x", amount=parameter),
+        *([Support("back", (0.0, 2.0, 0.0), "y", amount=parameter)] if y else []),
+    )
+    return replace(
+        between_plates(),
+        supports=supports,
+        parameters=(Parameter(parameter, "", 0.0, 1.0),),
+        constants={"mu": 2.0, "lam": 8.0},
+    )
+
+
+PULLED = {"1": 0.4, "2": 0.8}
+
+
+def seen(u):
+    x = np.stack(np.meshgrid(np.linspace(0.5, 3.5, 4), np.linspace(0.5, 3.5, 4)), -1).reshape(-1, 2)
+    return FullField(x, np.stack([u(x, amount) for amount in PULLED.values()]), tuple(PULLED))
+
+
+@pytest.mark.parametrize(
+    ("y", "u", "question"),
+    [
+        (True, lambda x, a: a * x / 4.0 * [1, 2], None),
+        (True, lambda x, a: 12.0 * a * x / 4.0 * [1, 2], "in mm, not in pixels?"),
+        (True, lambda x, a: a * x / 4.0 * [1, -2], "move against the pull along y: does y of the"),
+        (False, lambda x, a: a * (x - [0, 2]) / 4.0 * [1, -0.4], None),
+        (
+            False,
+            lambda x, a: a * (x - [0, 2]) / 4.0 * [1, 0.4],
+            "across the pull, by 20 % along it",
+        ),
+        (False, lambda x, a: 0.0 * x, None),
+    ],
+)
+def test_a_field_is_held_beside_what_pulls(y, u, question):
+    lines = list(field_doubts(pulled(y=y), seen(u), PULLED, "pull"))
+    assert [question in line for line in lines] == ([] if question is None else [True])
+    assert not list(field_doubts(pulled("other"), seen(u), PULLED, "pull"))
+
+
+def test_a_place_counts_once(field):
+    points = np.vstack([field.points, field.points[3] + 1e-6])
+    u = np.concatenate([field.displacement, field.displacement[:, 3:4]], axis=1)
+    with pytest.raises(InputError, match=r"points 4 and 13 are 1.4e-06 mm apart, .* counts once"):
+        FullField(points, u, field.frames)
+
+
+@pytest.mark.parametrize(
+    ("scale", "question"),
+    [((1.0, 1.0), None), ((10.0, 10.0), "not in pixels?"), ((1.0, -1.0), "rows count down")],
+)
+def test_doubts_are_said_by_the_command(cases, scale, question, tmp_path, capsys):
+    folder = cases / "tables" / "two_forces"
+    head, *rows = (folder / "moved.csv").read_text().splitlines()
+    lines = [head]
+    for row in rows:
+        frame, point, *u = row.split(",")
+        lines.append(
+            ",".join([frame, point, *(str(s * float(v)) for s, v in zip(scale, u, strict=True))])
+        )
+    (tmp_path / "moved.csv").write_text("\n".join(lines))
+    words = [
+        "frames",
+        folder / "plate.toml",
+        "--field",
+        folder / "points.csv",
+        tmp_path / "moved.csv",
+    ]
+    words += ["--amount", f"pull={folder / 'amount.csv'}:pull", "--out", tmp_path / "field.csv"]
+    code, told = answer(capsys, *words)
+    assert code == 0
+    assert [question in line for line in told["warnings"]] == ([] if question is None else [True])
+
+
+@pytest.mark.parametrize("name", ["keloid", "healthy"])
+def test_measured_skin_raises_no_doubt(measured, name):
+    folder = measured / "living_skin"
+    field = read_full_field(folder / f"{name}_points.csv", folder / f"{name}_displacements.csv")
+    amounts = {k: abs(a) for k, a in read_amounts(folder / f"{name}_pads.csv", "moving_ux").items()}
+    supports = (Support("right"), Support("left", (-1.0, 0.0, 0.0), "x", amount="pull"))
+    scene = replace(
+        between_plates(),
+        supports=supports,
+        parameters=(Parameter("pull", "", 0.0, 4.0),),
+        constants={"mu": 2.0, "lam": 8.0},
+    )
+    assert list(field_doubts(scene, field, amounts, "pull")) == []

@@ -5,17 +5,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cli_support import complaint
+from cli_support import answer, complaint
 from emulator.core.errors import InputError
 from emulator.geometry.facets import Cavity
 from emulator.geometry.generators.biventricle import biventricle
 from emulator.geometry.generators.ellipsoid import HUMAN
-from emulator.hearts.heart import mesh_heart, zipped
+from emulator.hearts.checks import mirrored
+from emulator.hearts.heart import mesh_wall
+from emulator.hearts.joints import zipped
 from emulator.hearts.remeshing import Unmeshable, triangulate
-from emulator.hearts.surfaces import Surface, clipped, rim_loops, surface
+from emulator.hearts.surfaces import Surface, clipped, read_surface, rim_loops, surface
 from emulator.scenes.draft import draft_scene
 from emulator.scenes.fibre_rules import Biventricle
 from surface_support import write
+
+
+def both(left, right, outer, **words):
+    return mesh_wall(left, outer, right=right, **words)
+
 
 SETS = ("lv_endocardium", "rv_endocardium", "epicardium")
 FRAMES = range(0, 25, 2)
@@ -88,7 +95,7 @@ def with_valves(flat, seed):
 
 def test_a_heart_with_a_flat_base(flat):
     needs_gmsh()
-    found = mesh_heart(*flat, size=9.0)
+    found = both(*flat, size=9.0)
     assert set(found.cavities) == set(SETS[:2])
     for cavity, own in found.cavities.values():
         assert cavity == pytest.approx(own, rel=0.01)
@@ -106,7 +113,7 @@ def test_a_heart_with_a_flat_base(flat):
 def test_valves_may_be_anywhere(flat, seed):
     needs_gmsh()
     surfaces = with_valves(flat, seed)
-    found = mesh_heart(*surfaces, size=6.0)
+    found = both(*surfaces, size=6.0)
     sets = found.mesh.facet_sets
     assert {"mitral", "aortic", "tricuspid", "pulmonary", "base"} < set(sets)
     for name, (cavity, own) in found.cavities.items():
@@ -140,9 +147,9 @@ def bad(flat):
     apex = left.points[np.argmin(left.points[:, 2])]
     outside = outer.points[np.argmin(outer.points[:, 2])]
     yield (outer, right, left), {}, "lv_endocardium and epicardium are swapped"
-    yield (left, left, outer), {}, "are one surface; give three"
-    yield (left, right, left), {}, "are one surface; give three"
-    yield (left, moved(left, 0.0), outer), {}, "are one surface; give three"
+    yield (left, left, outer), {}, "are one surface; give one of each wall"
+    yield (left, right, left), {}, "are one surface; give one of each wall"
+    yield (left, moved(left, 0.0), outer), {}, "are one surface; give one of each wall"
     yield (holed(left, apex), right, outer), {}, "no opening of the epicardium is at its opening"
     yield (left, right, holed(outer, outside)), {}, "neither endocardium has an opening at that"
     twice = holed(holed(left, apex), left.points[len(left.points) // 2])
@@ -166,7 +173,7 @@ def test_what_is_no_heart_is_refused(flat, number):
         for name, each in zip(SETS, surfaces, strict=True)
     ]
     with pytest.raises(InputError, match=said):
-        mesh_heart(*named, **words)
+        both(*named, **words)
 
 
 def test_openings_that_touch_are_refused(flat):
@@ -175,7 +182,7 @@ def test_openings_that_touch_are_refused(flat):
     ring = np.flatnonzero((left.triangles == at).any(axis=1))
     rows = np.delete(left.triangles, ring[[0, len(ring) // 2]], axis=0)
     with pytest.raises(InputError, match="two of its openings touch at"):
-        mesh_heart(replace(left, triangles=rows), right, outer)
+        both(replace(left, triangles=rows), right, outer)
 
 
 def test_rims_that_cross_are_not_given_to_gmsh():
@@ -200,11 +207,8 @@ def test_by_the_command_line_to_a_scene(flat, tmp_path, capsys):
     draft = draft_scene(out, tmp_path / "heart.toml")
     assert draft.scene.parameter_names[-2:] == ("pressure", "right_pressure")
     assert 'rule = "biventricle"' in draft.path.read_text()
-    for more, said in (
-        (["--base-height", "1"], "has no effect on both ventricles"),
-        (["--axis", "0", "0", "1"], "has no effect on both ventricles"),
-    ):
-        assert said in complaint(capsys, *words, "--out", out, *more)
+    assert main([*words, "--out", out, "--size", "11", "--base-height", "10"]) == 0
+    assert "above the base plane" in capsys.readouterr().out
     one = ["mesh", "--endocardium", files[0], "--epicardium", files[2], "--out", out]
     assert "give the right ventricle's" in complaint(capsys, *one, "--ventricles", "left")
     swapped = ["mesh", "--endocardium", files[2], "--right", files[1], "--epicardium", files[0]]
@@ -218,7 +222,7 @@ def test_every_frame_of_a_real_heart_is_meshed(measured):
     walls = []
     for frame in FRAMES:
         files = (f"{n}_{frame:03d}.obj" for n in ("LV_ENDOCARDIAL", "RV_ENDOCARDIAL", "EPICARDIAL"))
-        found = mesh_heart(*(folder / name for name in files))
+        found = both(*(folder / name for name in files))
         for cavity, own in found.cavities.values():
             assert cavity == pytest.approx(own, rel=6e-3)
         assert found.wall[0] == pytest.approx(found.wall[1], abs=2.0)  # mL, of thin walls and rims
@@ -228,3 +232,44 @@ def test_every_frame_of_a_real_heart_is_meshed(measured):
         walls.append(found.wall[0])
     # Muscle keeps its volume; the surfaces were fitted to images, each frame by itself.
     assert np.ptp(walls) < 0.25 * np.mean(walls)
+
+
+def test_two_endocardia_that_are_swapped_are_refused(flat, tmp_path, capsys):
+    left, right, outer = (
+        write(tmp_path / f"{each.name}.stl", each.points[each.triangles]) for each in flat
+    )
+    words = ["mesh", "--endocardium", right, "--right", left, "--epicardium", outer]
+    for more in ([], ["--ventricles", "left"]):
+        line = complaint(capsys, *map(str, [*words, *more, "--out", tmp_path / "heart.vtu"]))
+        assert (
+            "lv_endocardium and rv_endocardium are swapped: the left ventricle is the round" in line
+        )
+
+
+def test_valves_tell_a_mirrored_heart(measured):
+    folder = measured / "human_heart"
+    for frame in FRAMES:
+        surfaces = [
+            read_surface(folder / f"{name}_{frame:03d}.obj", name)
+            for name in ("LV_ENDOCARDIAL", "RV_ENDOCARDIAL", "EPICARDIAL")
+        ]
+        assert not list(mirrored(surfaces))
+        turned = [surface(s.name, s.points * [-1.0, 1.0, 1.0], s.triangles) for s in surfaces]
+        (line,) = mirrored(turned)
+        assert "as in a mirrored heart, whose fibres by rule have the wrong hand" in line
+
+
+def test_a_mirrored_heart_is_questioned_by_the_command(measured, tmp_path, capsys):
+    needs_gmsh()
+    words = ["mesh", "--out", tmp_path / "heart.vtu"]
+    for option, name in (
+        ("--endocardium", "LV_ENDOCARDIAL"),
+        ("--right", "RV_ENDOCARDIAL"),
+        ("--epicardium", "EPICARDIAL"),
+    ):
+        original = read_surface(measured / "human_heart" / f"{name}_018.obj", name)
+        mirror = original.points * [1.0, -1.0, 1.0]
+        words += [option, write(tmp_path / f"{name}.stl", mirror[original.triangles])]
+    code, told = answer(capsys, *words)
+    assert code == 0
+    assert ["mirrored heart" in line for line in told["warnings"]] == [True]

@@ -7,9 +7,9 @@ from cli_support import complaint
 from emulator.core.errors import InputError
 from emulator.geometry.generators.biventricle import biventricle
 from emulator.geometry.generators.ellipsoid import HUMAN
+from emulator.hearts.heart import mesh_wall
 from emulator.hearts.left_wall import left_wall
 from emulator.hearts.surfaces import Surface, read_surface, surface
-from emulator.hearts.two_surfaces import mesh_wall
 from surface_support import write
 
 NAMES = {"endocardium": "lv_endocardium", "epicardium": "epicardium", "right": "rv_endocardium"}
@@ -72,7 +72,7 @@ def test_every_frame_of_a_real_heart_is_meshed(measured):
             folder / f"{name}_{frame:03d}.obj"
             for name in ("LV_ENDOCARDIAL", "EPICARDIAL", "RV_ENDOCARDIAL")
         )
-        found = mesh_wall(inner, outer, right=right)
+        found = mesh_wall(inner, outer, right=right, ventricles="left")
         own = read_surface(inner, "endocardium").volume / 1000.0
         assert (
             0.75 * own < found.cavities["endocardium"][0] < own

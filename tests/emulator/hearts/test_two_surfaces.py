@@ -18,8 +18,8 @@ from emulator.geometry.generators.ellipsoid import HUMAN, human_ventricle
 from emulator.geometry.io import write_mesh
 from emulator.geometry.mesh import signed_volumes
 from emulator.geometry.refinement import refined
+from emulator.hearts.heart import mesh_wall
 from emulator.hearts.surfaces import Surface, read_surface
-from emulator.hearts.two_surfaces import mesh_wall
 from emulator.scenes.draft import draft_scene
 from surface_support import INSIDE, OUTSIDE, ellipsoid, write
 
@@ -207,8 +207,8 @@ def cut_open(path):
 
 WRONG = {
     "swapped": (lambda a, b: ((b, a), {}), "endocardium and epicardium are swapped"),
-    "crossing": (lambda a, b: ((moved(a, [15, 0, 0]), b), {}), r"the surfaces cross: \d+ of the endocardium's"),
-    "apart": (lambda a, b: ((moved(a, [90, 0, 0]), b), {}), "the endocardium lies outside of the epicardium"),
+    "crossing": (lambda a, b: ((moved(a, [15, 0, 0]), b), {}), r"(endo|epi)cardium crosses (endo|epi)cardium: \d+ of its"),
+    "apart": (lambda a, b: ((moved(a, [90, 0, 0]), b), {}), "endocardium lies outside of epicardium"),
     "metres": (lambda a, b: ((a, b), {"unit": "mm"}), r"endocardium: it is 0\.\d+ mm from corner to corner"),
     "hole": (lambda a, b: ((with_hole(a), b), {}), r"endocardium: it has 2 openings, the smallest of .* --base-height"),
     "no plane": (lambda a, b: ((a, b), {"base_height": None}), "endocardium: it is closed; give the base plane"),

@@ -68,32 +68,32 @@ def frames(arguments: Namespace) -> Answer:
     if bool(arguments.field) is bool(arguments.surface):
         raise InputError("frames: give either --surface or --field")
     measure = _full_field if arguments.field else _surfaces
-    observe, data, known = measure(words.scene_of(arguments), arguments)
+    observe, data, known, doubts = measure(words.scene_of(arguments), arguments)
     write_data(arguments.out, observe, data, known)
     result = {
         name: {
-            "mean": float(np.nanmean(values)),
-            "sd": float(np.nanstd(values)),
+            "mean": float(np.mean(values[np.isfinite(values)])),
+            "sd": float(np.std(values[np.isfinite(values)])),
             "missing": int(np.isnan(values).sum()),
         }
         for name, values in data.items()
     }
     rows = [(n, f"{of['mean']:.4g}", f"{of['sd']:.3g}", of["missing"]) for n, of in result.items()]
     lines = [table(("data", "mean (mm, mL, N)", "sd", "missing"), rows)]
-    if arguments.force:
-        lines.append(_THICKNESS)
-    lines.append(f"written to {arguments.out}")
-    return Answer({"out": arguments.out, "data": result}, "\n".join(lines))
+    lines += [*doubts, *([_THICKNESS] if arguments.force else ()), f"written to {arguments.out}"]
+    return Answer({"out": arguments.out, "data": result, "warnings": doubts}, "\n".join(lines))
 
 
 _THICKNESS = (
     "forces tell stiffness times thickness: the share by which the mesh's thickness may be off is "
     'an error of kind "gain" (docs/full_field.md)'
 )
-_Measured = tuple[Any, dict[str, Any], dict[str, float]]  # observations, data, known parameters
+# Observations, data, known parameters, and sentences on what contradicts itself.
+_Measured = tuple[Any, dict[str, Any], dict[str, float], list[str]]
 
 
 def _surfaces(scene: Scene, arguments: Namespace) -> _Measured:
+    from calibrate.measurements.frame_checks import frame_doubts
     from calibrate.measurements.frames import frame_data
     from calibrate.state_names import states_of
     from emulator.core.errors import look_up
@@ -110,7 +110,8 @@ def _surfaces(scene: Scene, arguments: Namespace) -> _Measured:
                 f"--surface '{word}'; give each as SET@STATE=FILE, such as lv_endocardium@es=lv.obj"
             )
         surfaces[name] = read_surface(path, name, IN_MM[arguments.unit])
-    return *frame_data(scene, surfaces, arguments.points), {}
+    observe, data = frame_data(scene, surfaces, arguments.points)
+    return observe, data, {}, [*frame_doubts(scene.mesh, surfaces, observe, data)]
 
 
 def _full_field(scene: Scene, arguments: Namespace) -> _Measured:

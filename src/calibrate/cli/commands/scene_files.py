@@ -190,26 +190,13 @@ _PLACE = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
 def mesh(arguments: Namespace) -> Answer:
     """Mesh the wall, and write the mesh and its picture."""
     from emulator.geometry.io import write_mesh
-    from emulator.hearts.heart import mesh_heart
-    from emulator.hearts.two_surfaces import mesh_wall
+    from emulator.hearts.heart import mesh_wall
 
     out, picture = arguments.out, arguments.picture
     words.check_vtu(out)
     if picture is not None:
         check_folder(Path(picture).parent)
-    both = arguments.right is not None and arguments.ventricles != "left"
-    if arguments.right is None and arguments.ventricles is not None:
-        raise InputError(
-            f"--ventricles {arguments.ventricles}: give the right ventricle's endocardium, --right"
-        )
-    for name in ("axis", "base_height", "base_point"):
-        if both and getattr(arguments, name) is not None:
-            raise InputError(
-                f"--{name.replace('_', '-')} has no effect on both ventricles, which end at their "
-                "valves; give --ventricles left"
-            )
-    make = mesh_heart if both else mesh_wall
-    wall = make(**words.parameters(make, arguments))
+    wall = mesh_wall(**words.parameters(mesh_wall, arguments))
     write_mesh(out, wall.mesh)
     names = ("mesh", "surface")
     result = {
