@@ -185,8 +185,8 @@ FIGURES: dict[str, tuple[int, Callable[[], list[str]]]] = {
     "public names": (143, public_names),
     "deep imports of studies": (565, deep_imports_of_studies),
     "files of the spine": (43, spine),
-    "lines of the spine": (10_715, lines_of_spine),
-    f"functions above {LONGEST} lines": (16, long_functions),
+    "lines of the spine": (10_712, lines_of_spine),
+    f"functions above {LONGEST} lines": (14, long_functions),
     **{f"names '{w}'": (most, partial(names_called, w)) for w, most in WORDS.items()},
 }
 """Each figure's ceiling, and what it counts."""

@@ -14,13 +14,7 @@ from calibrate.certificate.reweighting import can_reweight, reweighted
 from calibrate.measurements import missing_values
 from calibrate.posterior import Posterior, sample
 from calibrate.posterior.diagnosis import MAP_ERRORS, MAP_MOVES, SCALED_NOISE
-from calibrate.project.problem import (
-    Problem,
-    build_model,
-    read_problem,
-    simulator_of,
-    with_data,
-)
+from calibrate.project.problem import Problem, build_model, read_problem, simulator_of, with_data
 from calibrate.project.results import (
     CERTIFICATE,
     SAMPLING,
