@@ -20,7 +20,7 @@ ROOMS = {
         "emulator.surrogates.network.body",
         "emulator.surrogates.network.family",
         "emulator.fem.linear_response",
-        *(f"emulator.training.{name}" for name in ("physics", "sweeps", "paper")),
+        *(f"emulator.training.{name}" for name in ("physics", "sweeps", "paper", "families")),
     ),
     "specimens": (
         "emulator.specimens",
@@ -29,6 +29,7 @@ ROOMS = {
         "calibrate.project.specimen",
     ),
     "fields": (
+        "calibrate.fields",
         "calibrate.measurements.frames",
         "calibrate.measurements.full_field",
         "calibrate.cli.commands.frames",

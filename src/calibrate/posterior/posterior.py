@@ -23,7 +23,7 @@ from calibrate.posterior.box import BoxEnd, box_ends
 from calibrate.posterior.diagnosis import Summary, diagnose, misfits, nothing_learned, summary_of
 from calibrate.posterior.taken_up import TakenUp, sentences, taken_up
 from calibrate.provenance import as_attributes, versions
-from calibrate.samplers import check_options, density_of, find_sampler, named_draws
+from calibrate.samplers import check_options, density_of, find_sampler
 from calibrate.samplers.checkpoint import Checkpoint, identity_of
 from calibrate.samplers.modes import MISSED_BY, MOST, MOST_BY_FEM, explore, missed_mode
 from calibrate.samplers.protocol import Context

@@ -10,8 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from studies.any_ventricle import training as ventricles
-from studies.any_ventricle.training import PLAN, BodyRuns, family_of, train_family
 
 import emulator as em
 from emulator.core.errors import InputError
@@ -34,7 +32,9 @@ from emulator.surrogates.network.family import FamilyNetwork
 from emulator.surrogates.network.graph import AugmentedGraph
 from emulator.surrogates.network.pignn import Architecture, Processor
 from emulator.surrogates.taylor import constant
+from emulator.training import families as ventricles
 from emulator.training import recipe, train
+from emulator.training.families import BodyRuns, FamilyPlan, family_of, train_family
 from emulator.training.mechanics import Mechanics
 from emulator.training.plan import Job
 
@@ -108,7 +108,7 @@ def bodies() -> list[BodyRuns]:
 @pytest.fixture(scope="module")
 def family(folder: Path, bodies: list[BodyRuns]) -> Emulator:
     home = body(**SHAPES[0])
-    plan = replace(PLAN, steps=150, learning_rate=3e-3, checkpoint_every=100)
+    plan = replace(FamilyPlan(), steps=150, learning_rate=3e-3, checkpoint_every=100)
     return train_family(family_of(bodies, home, SMALL), "made up", plan, folder, home)
 
 
@@ -296,7 +296,7 @@ def test_cached_is_uncached_and_saved_is_loaded(family: Emulator, tmp_path: Path
 def test_a_resumed_training_is_the_uninterrupted_one(
     family: Emulator, folder: Path, bodies: list[BodyRuns], tmp_path: Path
 ) -> None:
-    home, plan = family.scene, replace(PLAN, steps=150, learning_rate=3e-3, checkpoint_every=40)
+    home, plan = family.scene, replace(FamilyPlan(), steps=150, learning_rate=3e-3, checkpoint_every=40)
 
     def killed(state: object, _: int) -> None:
         if getattr(state, "done", 0) == 100:
@@ -304,7 +304,7 @@ def test_a_resumed_training_is_the_uninterrupted_one(
 
     made = family_of(bodies, home, SMALL)
     with pytest.raises(KeyboardInterrupt):
-        train_family(made, "made up", plan, tmp_path, home, told=killed)
+        train_family(made, "made up", plan, tmp_path, home, after_step=killed)
     again = train_family(made, "made up", plan, tmp_path, home, resume=True)
     assert np.array_equal(again.cache()(home.centre), family.cache()(home.centre))
     with pytest.raises(InputError, match="belongs to another scene"):
@@ -327,7 +327,7 @@ def test_a_start_for_other_recipes(family: Emulator, tmp_path: Path) -> None:
     # Resumed, it is asked for again: the checkpoint of a training without a network has no weights.
     whole = train(scene, plan, tmp_path, start=family)
     with pytest.raises(InputError, match="stands on another emulator than is given"):
-        train(scene, PLAN, tmp_path, resume=True)
+        train(scene, FamilyPlan(), tmp_path, resume=True)
     again = train(scene, plan, tmp_path, start=family, resume=True)
     assert again.fingerprint == whole.fingerprint
 

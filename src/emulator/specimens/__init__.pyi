@@ -1,0 +1,17 @@
+from .gripped import GrippedSpecimen, learn_grips
+from .grips import GripStresses, Grips
+from .specimen import Specimen
+from .states import AXES, States, states
+from .tube import Tube
+
+__all__ = [
+    "AXES",
+    "GripStresses",
+    "GrippedSpecimen",
+    "Grips",
+    "Specimen",
+    "States",
+    "Tube",
+    "learn_grips",
+    "states",
+]
