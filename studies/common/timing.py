@@ -9,16 +9,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.fem import uniform
-from emulator.scenes import Scene
+import emulator as em
 
 Function = Callable[[jax.Array], Any]
 Clock = Callable[[], float]
 
 
-def unseen(scene: Scene, count: int, *, keys: Iterator[int] = itertools.count()) -> jax.Array:
+def unseen(scene: em.Scene, count: int, *, keys: Iterator[int] = itertools.count()) -> jax.Array:
     """Theta (count, p) that no call has had before."""
-    return uniform(scene, count, jax.random.key(2000 + next(keys)))
+    return em.fem.uniform(scene, count, jax.random.key(2000 + next(keys)))
 
 
 def per_call(function: Function, arguments: jax.Array, clock: Clock = time.perf_counter) -> float:
@@ -46,13 +45,13 @@ def loop(function: Function) -> Function:
     return jax.jit(lambda thetas: jax.lax.scan(step, jnp.zeros(()), thetas)[0])
 
 
-def in_loop(function: Function, scene: Scene, count: int, repeats: int = 5) -> float:
+def in_loop(function: Function, scene: em.Scene, count: int, repeats: int = 5) -> float:
     """Median over ``repeats`` of the seconds per theta in a compiled loop over ``count`` theta."""
     batches = unseen(scene, count * (repeats + 1)).reshape(repeats + 1, count, -1)
     return per_call(loop(function), batches) / count
 
 
-def batched(function: Function, scene: Scene, size: int, repeats: int = 5) -> float:
+def batched(function: Function, scene: em.Scene, size: int, repeats: int = 5) -> float:
     """Median over ``repeats`` of the seconds per theta in one call of ``size`` under ``vmap``."""
     batches = unseen(scene, size * (repeats + 1)).reshape(repeats + 1, size, -1)
     return per_call(jax.jit(jax.vmap(function)), batches) / size

@@ -29,7 +29,7 @@ from calibrate.samplers.modes import MISSED_BY, MOST, MOST_BY_FEM, explore, miss
 from calibrate.samplers.protocol import Context
 from calibrate.state_names import split
 from calibrate.statistical_model import Data, Model
-from calibrate.statistical_model.density import prior_draws
+from calibrate.statistical_model.density import named_draws, prior_draws
 from emulator.core.display import TableRepr
 from emulator.core.errors import InputError, check_known
 from emulator.core.machine import one_blas_thread

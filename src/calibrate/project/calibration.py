@@ -66,7 +66,7 @@ def infer(
     if not isinstance(run, Run | Problem):
         raise InputError(
             f"infer: {type(run).__name__} is not one run; calibrate infer FILE takes members of a "
-            "population, and calibrate.hierarchy their models"
+            "population, and calibrate.population.hierarchy their models"
         )
     target, stages = None if folder is None else Path(folder), Stages(show=progress)
     with nullcontext() if target is None else reserved(target, force=force):

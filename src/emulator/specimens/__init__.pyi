@@ -1,5 +1,5 @@
 from .gripped import GrippedSpecimen, learn_grips
-from .grips import GripStresses, Grips
+from .grips import Grips, GripStresses
 from .specimen import Specimen
 from .states import AXES, States, states
 from .tube import Tube

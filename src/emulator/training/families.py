@@ -381,7 +381,6 @@ def _taken(done: int, count: int, seed: int) -> int:
 
 def _descent(definition: Any, family: Family) -> Callable[..., tuple[jax.Array, Any, Any]]:
     """``descend(weights, number, body)``: loss, its gradient and the weights."""
-
     pressure = family.learned.space.names.index(family.learned.pressure)
 
     def loss(weights: Any, body: _Body) -> jax.Array:

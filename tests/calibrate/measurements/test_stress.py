@@ -88,7 +88,7 @@ def density(scene, u, theta):
     body = tetrahedra(scene)
     count = len(body.mesh.elements)
     at_corners = np.concatenate([np.zeros((count, 1, 3)), u.reshape(count, 3, 3)], axis=1)
-    whole, volume = em.strain_energy(body), body.discretisation.weights.sum() / count
+    whole, volume = em.fem.strain_energy(body), body.discretisation.weights.sum() / count
     alone = (at_corners * (np.arange(count) == k)[:, None, None] for k in range(count))
     return np.array([float(whole(jnp.asarray(x.reshape(-1, 3)), theta)) for x in alone]) / volume
 

@@ -296,7 +296,10 @@ def test_cached_is_uncached_and_saved_is_loaded(family: Emulator, tmp_path: Path
 def test_a_resumed_training_is_the_uninterrupted_one(
     family: Emulator, folder: Path, bodies: list[BodyRuns], tmp_path: Path
 ) -> None:
-    home, plan = family.scene, replace(FamilyPlan(), steps=150, learning_rate=3e-3, checkpoint_every=40)
+    home, plan = (
+        family.scene,
+        replace(FamilyPlan(), steps=150, learning_rate=3e-3, checkpoint_every=40),
+    )
 
     def killed(state: object, _: int) -> None:
         if getattr(state, "done", 0) == 100:

@@ -37,7 +37,7 @@ def test_a_step_descends_the_mean_energy(beam, simulator):
     """Its loss and its slope along a direction of all weights, by the scene's energy itself."""
     problem = Paper(batch=4, seed=3).prepare(Job(beam, SMALL))
     thetas = uniform(beam, 4, jax.random.fold_in(jax.random.key(3), 7))
-    Pi = em.potential_energy(beam)
+    Pi = em.fem.potential_energy(beam)
     centre = Pi(simulator(beam.centre), beam.centre)
 
     def mean_energy(weights):
@@ -72,7 +72,7 @@ def test_training_lowers_the_error_and_the_energy(tmp_path):
     emulator = train(scene, plan, tmp_path, architecture=SMALL)
     assert emulator.network.graph.real == len(scene.mesh.nodes)
     thetas = uniform(scene, 8, jax.random.key(1))
-    Pi = jax.vmap(em.potential_energy(scene))
+    Pi = jax.vmap(em.fem.potential_energy(scene))
     predicted = emulator.cache()(thetas)
     assert float(Pi(predicted, thetas).mean()) < 0.0  # of rest
     exact = jnp.stack([em.Simulator(scene)(theta) for theta in thetas])
