@@ -9,14 +9,16 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from numpyro.infer import MCMC
+from numpyro.infer import NUTS as NUTSKernel
 from studies.accuracy_vs_time.rungs import SEED, mechanics
 from studies.common.output import Case
 from studies.inverse_benchmark import entries, reference, tables
 from studies.inverse_benchmark.problems import PROBLEMS, data_of, model, scene_of
 from studies.inverse_benchmark.score import score
-from studies.samplers.ways import NUMPYRO, ways
 
 import calibrate as cal
 import emulator as em
@@ -28,9 +30,13 @@ FEW = entries.sampler("nuts", warmup=150, draws=250, chains=2, rounds=1)
 
 def by_numpyro(statistical: cal.Model, data: entries.Draws) -> tuple[entries.Draws, int]:
     """NumPyro's own NUTS with a dense metric, 4 chains of 1000 draws."""
-    drawn = ways(statistical, data, 1000)[NUMPYRO](3).draws
-    columns = drawn.reshape(-1, drawn.shape[-1])
-    return dict(zip(statistical.names, columns.T, strict=True)), 0
+    run = MCMC(
+        NUTSKernel(statistical, dense_mass=True), num_warmup=1000, num_samples=1000, num_chains=4,
+        chain_method="sequential", progress_bar=False,
+    )  # fmt: skip
+    run.run(jax.random.key(3), statistical.check_data(data))
+    drawn = run.get_samples()
+    return {name: np.asarray(drawn[name]) for name in statistical.names}, 0
 
 
 def _series(order: int) -> Callable[[em.Scene], em.ForwardMap]:

@@ -44,7 +44,7 @@ SEEN = 0.32
 NOISE = cal.CorrelatedNoise(length=LENGTH, sd_scale=0.2, spatial_sd_scale=0.4)  # kPa
 
 
-def scene_of(states_of_tests: em.specimens.States):
+def scene_of(states_of_tests: Any):
     """The specimen: fibres along x, sheets along y."""
     law = em.find_law(LAW)
     units = {quantity.name: quantity.unit for quantity in law.quantities}
@@ -63,7 +63,7 @@ def read(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def biaxial(rows: list[dict[str, str]]) -> tuple[em.specimens.States, np.ndarray]:
+def biaxial(rows: list[dict[str, str]]) -> tuple[Any, np.ndarray]:
     """States and Cauchy stresses (m, 2) in kPa of Sommer's tests, NaN where not measured.
 
     A row has the stretch and the stress along one axis; the ratio of the strains gives the other.
@@ -81,12 +81,11 @@ def biaxial(rows: list[dict[str, str]]) -> tuple[em.specimens.States, np.ndarray
     ), stresses
 
 
-def shears(amounts: dict[str, np.ndarray]) -> tuple[em.specimens.States, tuple[str, ...]]:
+def shears(amounts: dict[str, np.ndarray]) -> tuple[Any, tuple[str, ...]]:
     """States of simple shears by mode, and the stress that was measured in each."""
-    columns: dict[str, list[float]] = {f"stretch_{a}": [] for a in em.specimens.AXES}
+    columns: dict[str, list[float]] = {f"stretch_{a}": [] for a in "xyz"}
     planes = {
-        mode: "".join(em.specimens.AXES["fsn".index(letter)] for letter in mode[::-1])
-        for mode in amounts
+        mode: "".join("xyz"["fsn".index(letter)] for letter in mode[::-1]) for mode in amounts
     }
     columns |= {f"shear_{plane}": [] for plane in planes.values()}
     names = []

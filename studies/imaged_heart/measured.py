@@ -53,9 +53,9 @@ class Case:
     chords: np.ndarray
     read: float
 
-    def observed(self, scene: em.Scene) -> dict[str, cal.measurements.Observation]:
+    def observed(self, scene: em.Scene) -> dict[str, Any]:
         """What is observed of ``scene``, in which a loaded image may be the body at rest."""
-        found: dict[str, cal.measurements.Observation] = {
+        found: dict[str, Any] = {
             "volume:filling.endocardium": cal.CavityVolume(scene, "filling.endocardium"),
             "volume:systole.endocardium": cal.CavityVolume(scene, "systole.endocardium"),
             f"klotz:{self.read:.6g}": cal.KlotzVolume(scene, self.read),

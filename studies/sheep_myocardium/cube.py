@@ -105,13 +105,13 @@ def _law_of() -> em.Scene:
 
 def turned_to(number: int, x: jax.Array) -> jax.Array:
     """Fibre and sheet (2, 3) of a cube at a position (p,) in the box."""
-    f, s, across, along = _frame(number)
-    one = np.ones(())
-    angles = (
-        em.scenes.FibreAngles(across, {"in_plane": one}),
-        em.scenes.FibreAngles(along, {"out_of_plane": one}),
-    )
-    return em.scenes.turned(jnp.stack([f, s]), angles, _law_of().resolve(theta_of(x)))
+    f, s, *axes = _frame(number)
+    directions, values = jnp.stack([f, s]), _law_of().resolve(theta_of(x))
+    for axis, name in zip(axes, ("in_plane", "out_of_plane"), strict=True):
+        angle, n = jnp.deg2rad(values[name]), jnp.asarray(axis)
+        across, along = jnp.cross(n, directions), (directions @ n)[:, None] * n
+        directions = along + jnp.cos(angle) * (directions - along) + jnp.sin(angle) * across
+    return directions
 
 
 def theta_of(x: jax.Array) -> jax.Array:
@@ -150,7 +150,9 @@ def formula(x: jax.Array, H: jax.Array, C: jax.Array, area: jax.Array) -> jax.Ar
     x : (c, p) positions in the box, of which the material is the first's. H, C : (c, 3, j, 3, 3),
         see :func:`homogeneous`. area : (c,) mm2 of a plate.
     """
-    stress = jax.grad(em.fem.point_energy(_law_of(), theta_of(x[0])))
+    law, values = _law_of().law, _law_of().resolve(theta_of(x[0]))
+    parameters = [values[name] for name in law.parameters]
+    stress = jax.grad(lambda h, d: law.energy(em.laws.Strain(h, directions=d), *parameters))
     cubes, count, nodes = len(x), H.shape[1] * H.shape[2], len(_NODES)
     missed = np.zeros((nodes, x.shape[1]))
     missed[:, len(MATERIAL) :] = SPREAD / ANGLES[0].high * _NODES
@@ -160,6 +162,6 @@ def formula(x: jax.Array, H: jax.Array, C: jax.Array, area: jax.Array) -> jax.Ar
     each = jnp.broadcast_to(jnp.stack(directions)[:, :, None], (*shape, 2, 3))
     every = jnp.broadcast_to(H.reshape(cubes, 1, count, 3, 3), (*shape, 3, 3))
     flat = (every.reshape(-1, 3, 3), each.reshape(-1, 2, 3))
-    P = jax.vmap(lambda h, d: stress(h, em.scenes.Tissue(d)))(*flat).reshape(*shape, 3, 3)
+    P = jax.vmap(stress)(*flat).reshape(*shape, 3, 3)
     forces = jnp.einsum("m,ckij,cmkij->ck", _WEIGHTS, C.reshape(cubes, count, 3, 3), P)
     return 1e-3 * area[:, None] * forces  # kPa mm2 is mN

@@ -28,10 +28,11 @@ from studies.sheep_myocardium.experiment import Curve, Heart
 from studies.sheep_myocardium.process import Known, Process
 from threadpoolctl import threadpool_limits
 
+import calibrate as cal
 import emulator as em
 
 _TOLERANCE = 1e-6  # of forces without slopes, which are then known to 1e-8
-_AXES = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))  # along which each mode moves
+_AXES = "yzx"  # along which each mode moves
 
 
 class Runs(NamedTuple):
@@ -110,21 +111,21 @@ class Cube:
         found = self.simulator.path(thetas)
         # Behind a point that did not converge the path is lost.
         sound = np.logical_and.accumulate(np.asarray(found.converged))
-        rates = 0.5e-3 * np.asarray(self.body.space.rates(thetas)[:, : self.unknowns])
+        rates = 0.5 * np.asarray(self.body.space.rates(thetas)[:, : self.unknowns])
         force, slopes = np.full(len(amounts), np.nan), np.full(rates.shape, np.nan)
         for k in np.flatnonzero(sound):
             value, rising = self._forces[mode](found.displacement[k], thetas[k])
-            force[k] = 1e-3 * value  # mN
+            force[k] = value
             slopes[k] = rising[: self.unknowns] * rates[k]
         return [force, slopes]
 
     @cached_property
     def _forces(self) -> list[Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]]:
-        """Of each mode, the force along its motion in mN with its gradient (p + 3,) in theta."""
+        """Of each mode, the force along its motion in N with its gradient (p + 3,) in theta."""
 
-        def along(axis: tuple[float, float, float]) -> em.laws.Quantity:
-            force = em.fem.SupportForce(self.body, "right", axis)
-            return lambda u, theta: force(u[force.nodes], theta)
+        def along(axis: str) -> Callable[[jax.Array, jax.Array], jax.Array]:
+            force = cal.Reaction(self.body, "right", axis)
+            return lambda u, theta: force.evaluate(u[force.nodes], theta)
 
         each = [along(axis) for axis in _AXES]
         if self.sloping:

@@ -47,7 +47,7 @@ def posterior(
 def what_was_unknown(found: cal.Posterior, seen: Measured) -> Case:
     """Posterior mean and sd of hand, rig, pins and the loose marker, in mm and degrees."""
     error = found.model.error
-    assert isinstance(error, cal.model_error.ModelError)
+    assert error is not None
     draws = flat(found)
     each = []
     for k in range(0, len(draws["mu"]), max(1, len(draws["mu"]) // 200)):

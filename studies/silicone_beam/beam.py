@@ -136,7 +136,7 @@ def predict(
 
     stayed, moved = [], []
     error = calibrated.error
-    assert isinstance(error, cal.model_error.ModelError)
+    assert error is not None
     for k in range(len(draws["mu"])):
         draw = {name: jnp.asarray(values[k]) for name, values in draws.items()}
         means, _ = calibrated.predict(draw)

@@ -52,7 +52,7 @@ _SAME_MODEL = (
 
 @dataclass(frozen=True)
 class Shared:
-    """The settings that all members of a population share, as in :func:`calibrate.population.hierarchy`.
+    """The settings that all members of a :func:`calibrate.population.hierarchy` share.
 
     shared : unknowns that follow the population; by default all that every member has.
     median : median and relative sd of a log-normal prior of the population's median, by name.

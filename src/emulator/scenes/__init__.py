@@ -20,13 +20,12 @@ from emulator.scenes.fibre_rules import Helix
 from emulator.scenes.parameter_space import Parameter as Parameter
 from emulator.scenes.scene import Scene as Scene
 from emulator.scenes.supports import Support as Support
-from emulator.scenes.tissue import FibreAngles, Tissue, turned
+from emulator.scenes.tissue import FibreAngles
 
 __all__ = [
     "BUILT_IN",
     "FibreAngles",
     "Helix",
-    "Tissue",
     "biventricle",
     "left_ventricle",
     "left_ventricle_neo_hookean",
@@ -35,7 +34,6 @@ __all__ = [
     "once_clamped_beam",
     "traction_beam_guccione",
     "traction_beam_holzapfel_ogden",
-    "turned",
     "turned_beam",
     "twice_clamped_beam",
     "twisting_cube",

@@ -34,6 +34,7 @@ from emulator.core.errors import InputError
 from emulator.fem.linear_response import pressure_force
 from emulator.geometry.discretisation import shapes_at
 from emulator.geometry.mesh import Mesh
+from emulator.mechanics.kinematics import cofactor
 from emulator.scenes.scene import Scene
 from emulator.surrogates.emulator import Emulator
 from emulator.surrogates.network.body import BodyFeatures, describe
@@ -197,8 +198,9 @@ def _prepared(
     nodes = mesh.nodes / size
     slopes = shapes_at(mesh.order, np.full((1, 4), 0.25))[1][0]
     jacobian = np.einsum("mai,aj->mij", nodes[mesh.elements], slopes)
-    gradients = np.einsum("aj,mji->mai", slopes, np.linalg.inv(jacobian))
     volumes = np.linalg.det(jacobian)
+    inverse = np.swapaxes(jax.vmap(cofactor)(jacobian), 1, 2) / volumes[:, None, None]
+    gradients = np.einsum("aj,mji->mai", slopes, inverse)
     growth = [pressure_force(mesh, mesh.nodes + u, CAVITY) for u in runs.displacement]
     fields = np.concatenate([runs.displacement[:, None], runs.slopes], axis=1) / size
     count = len(nodes)
@@ -259,7 +261,7 @@ def family_of(
         raise InputError(f"a family: the range of its {PRESSURE} does not begin at zero")
     standard = standard_of([body.features for body in runs])
     rng, sizes = np.random.default_rng(seed), _Sizes.of(runs)
-    bodies = [_prepared(each, standard, sizes, rng) for each in runs]
+    bodies = [_prepared(body, standard, sizes, rng) for body in runs]
     names = runs[0].features.shape
     numbers = np.array([list(body.features.shape.values()) for body in runs])
     ranges = zip(numbers.min(axis=0).tolist(), numbers.max(axis=0).tolist(), strict=True)
@@ -374,7 +376,7 @@ def train_family(
 
 
 def _taken(done: int, count: int, seed: int) -> int:
-    """Which of ``count`` bodies a step takes: all of them, in an order of its own each epoch."""
+    """Which of ``count`` bodies a step takes: all of them, in another order in every epoch."""
     epoch, place = divmod(done, count)
     return int(np.random.default_rng((seed, epoch)).permutation(count)[place])
 
