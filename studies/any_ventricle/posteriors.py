@@ -22,8 +22,7 @@ DRAWS = 40
 def first_posterior(make: Callable[[], em.Scene], number: int, tests: int, kept: Path) -> Any:
     """The posterior of FEM's data at one theta by the network, and by a series that FEM certifies.
 
-    The means' moves are in sd of the latter. The network's own error bar is what
-    ``infer --no-certify`` says.
+    The means' moves are in sd of the latter.
     """
     scene = make()
     known, _ = references(scene, number, tests, (False, False), kept)

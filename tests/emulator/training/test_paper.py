@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.core.errors import InputError
+from emulator.core.errors import InputError, SolverError
 from emulator.fem.campaign.designs import uniform
 from emulator.geometry.refinement import to_quadratic
 from emulator.surrogates import Architecture
-from emulator.training import recipe, train
+from emulator.training import paper, recipe, train
 from emulator.training.network_plan import with_weights
 from emulator.training.paper import Paper
 from emulator.training.plan import Job
@@ -78,3 +78,31 @@ def test_training_lowers_the_error_and_the_energy(tmp_path):
     exact = jnp.stack([em.Simulator(scene)(theta) for theta in thetas])
     left = jnp.linalg.norm(predicted - exact, axis=-1).mean()
     assert left < 0.8 * jnp.linalg.norm(exact, axis=-1).mean()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("rate", "exponent"), [(1e-3, 1.0), (1.0, 1.0), (1e-3, 10.0)])
+def test_training_without_barriers_ends_honestly(rate, exponent, tmp_path, monkeypatch):
+    """In a named error, or in a poor network whose error bar is right (Eq. 21 to 23 are left out)."""
+    monkeypatch.setattr(paper, "Barriers", lambda: None)
+    scene = em.scenes.left_ventricle(4, 8, 1, order=1)
+    stiffer = tuple(
+        replace(p, low=exponent * p.low, high=exponent * p.high) if p.name in ("b", "b_f") else p
+        for p in scene.parameters
+    )
+    scene = replace(scene, parameters=stiffer, origin={})
+    try:
+        emulator = train(scene, Paper(steps=60, learning_rate=rate), tmp_path)
+    except SolverError as error:
+        assert rate == 1.0
+        assert "lower the learning rate" in str(error)
+        return
+    forward, simulator = emulator.cache(), em.Simulator(scene)
+    bar = em.ErrorBar(forward, simulator)
+    for theta in em.fem.sobol(scene, 4, 11):
+        away = np.asarray(forward(theta) - simulator(theta))
+        estimate = bar(theta)
+        assert np.isfinite(away).all()
+        if estimate.valid:
+            true = np.median(np.linalg.norm(away, axis=1))
+            assert 1.0 / 3.0 < float(estimate.median) / true < 3.0
