@@ -176,7 +176,7 @@ def _graph(
     nodes = [_padded(regions, sizes.regions), _padded(above, sizes.virtual)]
     pair = np.stack([graph.senders, graph.receivers])
     pair = pair + np.where(pair < real, 0, sizes.regions - real)
-    turned = generator.random(pair.shape[1]) < 0.5
+    turned = np.asarray(generator.random(pair.shape[1])) < 0.5
     signs = np.where(turned[:, None], [-1.0, -1.0, -1.0, 1.0], 1.0)
     edges = (signs * features.graph.edge_features - standard.edge[0]) / standard.edge[1]
     ends = np.full((2, sizes.edges), sizes.regions + sizes.virtual - 1, np.int32)
@@ -206,7 +206,7 @@ def _prepared(
     count = len(nodes)
     return _Body(
         inputs=Inputs(
-            graph=_graph(runs.features, standard, sizes, generator),
+            graph=cast(Any, _graph(runs.features, standard, sizes, generator)),
             local=_padded(inputs.local, sizes.nodes),
             near=_padded(inputs.near, sizes.nodes),
             closeness=_padded(inputs.closeness, sizes.nodes),
