@@ -9,6 +9,7 @@ import inspect
 import json
 import re
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 
 import calibrate
@@ -40,14 +41,27 @@ def _public(package: object) -> list[str]:
     """Lines of a page about every public name of a package."""
     title = f"``{package.__name__}``"
     lines = [title, "=" * len(title), "", f".. module:: {package.__name__}", ""]
-    for name in sorted(package.__all__, key=str.lower):
-        thing = getattr(package, name)
-        path = f"{package.__name__}.{name}"
+    lines += _names(package, package.__name__, package.__all__)
+    for name in package.__all__:
+        module = getattr(package, name)
+        if inspect.ismodule(module):
+            path = f"{package.__name__}.{name}"
+            lines += [f"``{path}``", "-" * (len(path) + 4), ""]
+            lines += [module.__doc__.strip().splitlines()[0], ""]
+            lines += _names(module, path, set(module.__all__) - set(package.__all__))
+    return lines
+
+
+def _names(module: object, door: str, names: Iterable[str]) -> list[str]:
+    """Lines about the public names that ``door``, such as ``emulator.fem``, offers."""
+    lines = []
+    for name in sorted(names, key=str.lower):
+        thing, path = getattr(module, name), f"{door}.{name}"
         if inspect.ismodule(thing):
-            lines += [f"- ``{path}``: {thing.__doc__.strip().splitlines()[0]}", ""]
             continue
         if isinstance(thing, dict):
-            lines += [f".. data:: {name}", "", f"   A registry: {', '.join(thing)}.", ""]
+            lines += [f".. data:: {name}", f"   :module: {door}", ""]
+            lines += [f"   A registry: {', '.join(thing)}.", ""]
             continue
         kind = "class" if inspect.isclass(thing) else "function" if callable(thing) else "data"
         lines += [f".. auto{kind}:: {path}"]

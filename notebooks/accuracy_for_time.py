@@ -55,7 +55,7 @@ def series(order):
 
 simulator.solve(scene.centre)  # compiles, so that the runs below are timed without it
 began = time.process_time()
-runs = em.run_campaign(simulator, em.fem.sobol(scene, 30, seed=4))
+runs = em.fem.run_campaign(simulator, em.fem.sobol(scene, 30, seed=4))
 reduced = em.fit_reduced(scene, runs)
 offline_reduced = time.process_time() - began
 print(f"30 FEM runs and the fit of POD + GP: {offline_reduced:.0f} s")
@@ -191,7 +191,7 @@ data = {
     "volume": np.asarray(volume(exact[volume.nodes], truth)) + rng.normal(),
 }
 length = {
-    "options": cal.NUTSOptions(warmup=300, draws=500, chains=2, rounds=2),
+    "options": cal.samplers.NUTSOptions(warmup=300, draws=500, chains=2, rounds=2),
     "predictions": False,
     "seed": 1,
 }

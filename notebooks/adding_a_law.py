@@ -283,11 +283,11 @@ for states in (("low",), ("low", "high")):
     posteriors[states] = cal.sample(
         model,
         {name: data[name] for name in names},
-        options=cal.NUTSOptions(warmup=300, draws=400, rounds=3),
+        options=cal.samplers.NUTSOptions(warmup=300, draws=400, rounds=3),
         seed=1,
     )
     print(f"seen at {' and '.join(states)} pressure:")
-    print(cal.in_words(cal.identify(posteriors[states])))
+    print(cal.analysis.in_words(cal.identify(posteriors[states])))
 
 # %%
 figure, axes = plt.subplots(figsize=(4.6, 3.8), layout="constrained")

@@ -41,7 +41,7 @@ for parameter in scene.parameters:
 simulator = em.Simulator(scene)
 truth = scene.theta(mu=73.0, lam=61.0)
 solution = simulator.solve(truth)
-print(em.Status(int(solution.status)).text, "in", int(solution.iterations), "iterations")
+print(em.fem.Status(int(solution.status)).text, "in", int(solution.iterations), "iterations")
 print(f"tip moves by {float(np.linalg.norm(solution.displacement, axis=1).max()):.2f} mm")
 
 # %% [markdown]

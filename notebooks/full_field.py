@@ -18,7 +18,7 @@
 #
 # Two pads are glued to skin, one is pulled, a camera follows points between them and a sensor the force. Image correlation gives tables of points over frames. How stiff is a scar beside its skin?
 #
-# The data here are made, so that the truth is known; `studies/living_skin` does it with a real scar. With tables of your own, `cal.read_full_field("points.csv", "displacements.csv")` takes the place of the section *The tables*, and `em.mesh_sheet`, which takes Gmsh, that of the box.
+# The data here are made, so that the truth is known; `studies/living_skin` does it with a real scar. With tables of your own, `cal.fields.read_full_field("points.csv", "displacements.csv")` takes the place of the section *The tables*, and `em.hearts.mesh_sheet`, which takes Gmsh, that of the box.
 
 # %%
 from dataclasses import replace
@@ -96,7 +96,7 @@ for name, pull in pulls.items():
     force[name] = float(pad(u[pad.nodes], theta)) + rng.normal(0.0, 0.002)
 moved = np.array(moved)
 moved[rng.uniform(size=moved.shape[:2]) < 0.05] = np.nan
-field = cal.FullField(points, moved, tuple(pulls))
+field = cal.fields.FullField(points, moved, tuple(pulls))
 print({name: f"{1e3 * value:.0f} mN" for name, value in force.items()})
 
 # %% [markdown]
@@ -121,7 +121,7 @@ assert abs(by_work / by_fem - 1) < 0.01
 # Frames are load states, whose pull is known. Once every number errs by itself, with an sd that is inferred; once the error is a `field`, alike over 5 mm.
 
 # %%
-observe, data = cal.field_data(sheet, field.only(tuple(pulls), np.arange(60)), pulls)
+observe, data = cal.fields.field_data(sheet, field.only(tuple(pulls), np.arange(60)), pulls)
 parts = {**observe.parts, **{f"reaction:moving:x@{name}": pad for name in pulls}}
 data = {**data, **{f"reaction:moving:x@{name}": np.array(value) for name, value in force.items()}}
 known = {f"pull@{name}": pull for name, pull in pulls.items()}

@@ -85,7 +85,7 @@ only_volume = cal.sample(
 only_volume
 
 # %%
-print(cal.in_words(cal.identify(only_volume)))
+print(cal.analysis.in_words(cal.identify(only_volume)))
 
 # %% [markdown]
 # *Known best* is a product of powers. It says in one line what the volume measures: pressure over stiffness, to a few percent.
@@ -100,7 +100,7 @@ posterior
 
 # %%
 found = cal.identify(posterior)
-print(cal.in_words(found))
+print(cal.analysis.in_words(found))
 summary = posterior.summary()
 for name, row in summary.items():
     assert row["r_hat"] < 1.02, name
@@ -182,7 +182,7 @@ for label, found_by, colour in (
     ("images", posterior, BLUE),
     ("images and catheter", invasive, ORANGE),
 ):
-    band = cal.stress_band(found_by, "fibre", stretches=np.linspace(1.0, 1.2, 21))
+    band = cal.analysis.stress_band(found_by, "fibre", stretches=np.linspace(1.0, 1.2, 21))
     left.fill_between(
         band.stretch, band.low, band.high, color=colour, alpha=0.35, lw=0, label=label
     )

@@ -79,8 +79,8 @@ plain = cal.model(emulator, observe, noise, known=known)
 # A rigid motion that several observations share: how far it may move (mm) and turn (degrees). Both are marginalised exactly; nothing is added to what is sampled.
 
 # %%
-hand = cal.rigid_motion("hand", dict.fromkeys(observe, pins), 1.0, 1.0)
-rig = cal.rigid_motion("rig", {"markers@loaded": pins}, 2.0, 1.5, about=np.zeros(3))
+hand = cal.model_error.rigid_motion("hand", dict.fromkeys(observe, pins), 1.0, 1.0)
+rig = cal.model_error.rigid_motion("rig", {"markers@loaded": pins}, 2.0, 1.5, about=np.zeros(3))
 honest = cal.with_systematic(plain, hand, rig)
 
 # %% [markdown]

@@ -59,7 +59,7 @@ model = cal.model(forward, observe, cal.GaussianNoise(sd=0.3))
 # line, and the Jacobian is included. The data is an argument, so a compiled sampler serves the next data set too.
 
 # %%
-density = cal.density_of(model)
+density = cal.samplers.density_of(model)
 _, given = model.given(data)  # checked, by name
 print("coordinates:", density.names)
 
@@ -165,11 +165,11 @@ assert abs(found["noise_sd"].mean() - 0.3) < 4.0 * found["noise_sd"].std()
 # %%
 size = {"warmup": 300, "draws": 400, "chains": 4}
 OPTIONS = {
-    "importance": cal.ImportanceOptions(draws=400),
-    "nuts": cal.NUTSOptions(**size, rounds=1),
-    "blackjax_nuts": cal.BlackJAXNUTSOptions(**size, rounds=1),
-    "smc": cal.SMCOptions(draws=300, transitions=5),
-    "laplace": cal.LaplaceOptions(draws=400),
+    "importance": cal.samplers.ImportanceOptions(draws=400),
+    "nuts": cal.samplers.NUTSOptions(**size, rounds=1),
+    "blackjax_nuts": cal.samplers.BlackJAXNUTSOptions(**size, rounds=1),
+    "smc": cal.samplers.SMCOptions(draws=300, transitions=5),
+    "laplace": cal.samplers.LaplaceOptions(draws=400),
 }
 posteriors, seconds = {}, {}
 for name, options in OPTIONS.items():

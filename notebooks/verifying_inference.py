@@ -46,7 +46,7 @@ data = clean + rng.normal(0.0, noise_sd, clean.shape)
 print(f"points move by {np.linalg.norm(clean, axis=1).mean():.1f} mm on average")
 
 model = cal.model(forward, observe, cal.GaussianNoise(sd=noise_sd))
-posterior = cal.sample(model, data, options=cal.NUTSOptions(warmup=300, draws=500), seed=1)
+posterior = cal.sample(model, data, options=cal.samplers.NUTSOptions(warmup=300, draws=500), seed=1)
 for name, row in posterior.summary().items():
     true = float(truth[scene.parameter_names.index(name)])
     print(f"{name:4s}{row['mean']:7.3f} +- {row['sd']:.3f} kPa, truth {true}")
@@ -138,11 +138,13 @@ assert certificate.verdict == "accepted"
 # uniform (Talts et al. 2018). `truth=by_fem(model)` is the line that makes FEM the judge.
 
 # %%
-short = cal.NUTSOptions(warmup=150, draws=200, chains=1, rounds=1)
+short = cal.samplers.NUTSOptions(warmup=150, draws=200, chains=1, rounds=1)
 found = cal.sbc(model, 60, truth=cal.by_fem(model), options=short, seed=11)
 print("inside the 95 % band" if found.passed else "outside the 95 % band")
 for name, rows in found.coverage().items():
-    covered = ", ".join(f"{100 * level:.0f} %: {100 * rows[level][0]:.0f}" for level in cal.LEVELS)
+    covered = ", ".join(
+        f"{100 * level:.0f} %: {100 * rows[level][0]:.0f}" for level in cal.analysis.LEVELS
+    )
     print(f"{name:15s} nominal and actual coverage {covered}")
 assert not any(found.outside(0.99).values())  # of right posteriors 1 in 100 leaves this band
 
@@ -196,7 +198,9 @@ displaced = np.asarray(seen(told.fine[seen.nodes], truth))
 difference = np.linalg.norm(displaced - clean, axis=1).mean()
 counts = f"{len(body.mesh.nodes)} nodes for {len(scene.mesh.nodes)}"
 print(f"{counts}: landmarks differ by {difference:.3f} mm")
-biased = cal.sample(model, displaced, options=cal.NUTSOptions(warmup=300, draws=500), seed=2)
+biased = cal.sample(
+    model, displaced, options=cal.samplers.NUTSOptions(warmup=300, draws=500), seed=2
+)
 second = cal.certify(biased, simulator, draws=80)
 print(second)
 for name, row in biased.summary().items():

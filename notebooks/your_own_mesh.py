@@ -115,7 +115,7 @@ scene = em.find_scene("patient.toml")
 scene
 
 # %%
-cavity = em.Cavity(scene.mesh, "LV_endo")
+cavity = em.geometry.Cavity(scene.mesh, "LV_endo")
 exact = em.generators.HUMAN.cavity_volume / 1000.0
 print(f"cavity {cavity.rest:.1f} mL, of the ellipsoid {exact:.1f} mL")
 assert 0.95 < cavity.rest / exact < 1.0
@@ -135,7 +135,9 @@ assert quality.min() > 0.1
 # of our own.
 
 # %%
-deep = em.wall_depth(scene.mesh, ("LV_endo",), ("LV_epi",))  # 0 inside, 1 outside, and the normal
+deep = em.geometry.wall_depth(
+    scene.mesh, ("LV_endo",), ("LV_epi",)
+)  # 0 inside, 1 outside, and the normal
 around = np.cross([0.0, 0.0, 1.0], deep.normal)
 around /= np.linalg.norm(around, axis=-1, keepdims=True)
 upwards = np.cross(deep.normal, around)
@@ -187,7 +189,7 @@ for parameter, value in zip(scene.parameters, theta, strict=True):
     print(f"{parameter.name:9s}{float(value):6.3f} {parameter.unit}")
 solution = simulator.solve(theta)
 u = np.asarray(solution.displacement)
-print(em.Status(int(solution.status)).text, "in", int(solution.iterations), "iterations")
+print(em.fem.Status(int(solution.status)).text, "in", int(solution.iterations), "iterations")
 print(f"cavity {cavity.rest:.1f} mL -> {float(cavity(u[cavity.nodes])):.1f} mL")
 
 # %% [markdown]
@@ -198,7 +200,9 @@ print(f"cavity {cavity.rest:.1f} mL -> {float(cavity(u[cavity.nodes])):.1f} mL")
 # %%
 moved = scene.mesh.nodes + u
 pressure = float(theta[scene.parameter_names.index("pressure")])
-tissue = np.asarray(jax.jit(jax.grad(em.strain_energy(scene)))(solution.displacement, theta))  # mN
+tissue = np.asarray(
+    jax.jit(jax.grad(em.fem.strain_energy(scene)))(solution.displacement, theta)
+)  # mN
 wall_facets = scene.mesh.facet_sets["LV_endo"]  # ordered so that their normals leave the tissue
 # Dunavant's six points of a triangle, exact to degree 4, barycentric; weights sum to 1.
 p = np.array(
@@ -243,7 +247,7 @@ print(f"force of the base {held.round(2)} mN; pressure times area {pressure * op
 assert np.abs(held - [0.0, 0.0, pressure * opening]).max() < 1e-5 * pressure * opening
 
 # %%
-half = em.boundary_facets(scene.mesh.elements[corners.mean(axis=1)[:, 1] > 0.0])[:, :3]
+half = em.geometry.boundary_facets(scene.mesh.elements[corners.mean(axis=1)[:, 1] > 0.0])[:, :3]
 size = np.linalg.norm(u, axis=1)
 figure = plt.figure(figsize=(7.2, 3.3), layout="constrained")
 both = np.concatenate([scene.mesh.nodes, moved])
@@ -271,9 +275,9 @@ plt.show()
 Path("linear.toml").write_text(Path("patient.toml").read_text().replace("order = 2", "order = 1"))
 stiff = em.find_scene("linear.toml")
 locked = em.Simulator(stiff).solve(theta).require_converged("linear elements").displacement
-plain = em.Cavity(stiff.mesh, "LV_endo")
+plain = em.geometry.Cavity(stiff.mesh, "LV_endo")
 mesh_error = em.mesh_error(simulator)
-finest = em.Cavity(mesh_error.finer.scene.mesh, "LV_endo")
+finest = em.geometry.Cavity(mesh_error.finer.scene.mesh, "LV_endo")
 of_mesh = mesh_error(theta)
 growth = {
     "linear": (stiff, float(plain(locked[plain.nodes])) - plain.rest),

@@ -12,6 +12,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from functools import cache, partial
 from pathlib import Path
+from types import ModuleType
 
 ROOT = Path(__file__).resolve().parents[1]
 WORDS = {"own": 0, "found": 0, "given": 2, "told": 0, "moved": 0, "each": 0}
@@ -143,11 +144,60 @@ def public_names() -> list[str]:
     return sorted({*calibrate.__all__, *emulator.__all__})
 
 
+@cache
+def front_doors() -> dict[str, frozenset[str]]:
+    """Return the names that a user may take from ``em`` and ``cal`` and their public sub-modules.
+
+    A public sub-module is one that ``import emulator`` or ``import calibrate`` offers, as NumPy
+    offers ``numpy.linalg``; its public names are those of its ``__all__``.
+    """
+    import calibrate
+    import emulator
+
+    doors = {}
+    for short, package in (("em", emulator), ("cal", calibrate)):
+        doors[short] = frozenset(package.__all__)
+        for name in package.__all__:
+            if isinstance(module := getattr(package, name), ModuleType):
+                doors[f"{short}.{name}"] = frozenset(module.__all__)
+    return doors
+
+
+def names_of_submodules() -> list[str]:
+    """Return the public names that only a public sub-module offers."""
+    return [
+        f"{door}.{name}"
+        for door, names in front_doors().items()
+        if "." in door
+        for name in sorted(names - front_doors()[door.split(".")[0]])
+    ]
+
+
 def deep_imports_of_studies() -> list[str]:
-    """Return the lines of studies that import from within the packages."""
-    deep = re.compile(r"^\s*(from|import) (calibrate|emulator)\.\w.*$", re.MULTILINE)
-    files = sorted((ROOT / "studies").rglob("*.py"))
-    return [m[0].strip() for path in files for m in deep.finditer(path.read_text("utf-8"))]
+    """Return what studies take from within the packages, past their front doors.
+
+    Imports from a module of either package, and names that are in no public ``__all__``.
+    """
+    deep = []
+    for path in sorted((ROOT / "studies").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            deep += [f"{path.parent.name}: {name}" for name in _past_the_door(node)]
+    return deep
+
+
+def _past_the_door(node: ast.AST) -> list[str]:
+    packages = {"emulator": "em", "calibrate": "cal"}
+    if isinstance(node, ast.Import):
+        names = [alias.name for alias in node.names]
+        return [name for name in names if name.split(".")[0] in packages and "." in name]
+    if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in packages:
+        offered = front_doors().get(packages.get(node.module, ""), frozenset())
+        return [f"{node.module}.{a.name}" for a in node.names if a.name not in offered]
+    if isinstance(node, ast.Attribute):
+        door = ast.unparse(node.value)
+        if door in front_doors() and node.attr not in front_doors()[door]:
+            return [f"{door}.{node.attr}"]
+    return []
 
 
 def names_called(word: str) -> list[str]:
@@ -182,8 +232,9 @@ FIGURES: dict[str, tuple[int, Callable[[], list[str]]]] = {
     "files that weight points": (5, weighted_points),
     "files that solve dense systems": (19, dense_solves),
     "members of Observation": (11, observation_members),
-    "public names": (143, public_names),
-    "deep imports of studies": (565, deep_imports_of_studies),
+    "public names": (108, public_names),
+    "names of public sub-modules": (144, names_of_submodules),
+    "deep imports of studies": (0, deep_imports_of_studies),
     "files of the spine": (43, spine),
     "lines of the spine": (10_712, lines_of_spine),
     f"functions above {LONGEST} lines": (14, long_functions),

@@ -20,7 +20,7 @@ ROOMS = {
         "emulator.surrogates.network.body",
         "emulator.surrogates.network.family",
         "emulator.fem.linear_response",
-        *(f"emulator.training.{name}" for name in ("physics", "sweeps", "paper")),
+        *(f"emulator.training.{name}" for name in ("physics", "sweeps", "paper", "families")),
     ),
     "specimens": (
         "emulator.specimens",
@@ -30,6 +30,7 @@ ROOMS = {
     ),
     "fields": (
         "calibrate.measurements.frame_checks",
+        "calibrate.fields",
         "calibrate.measurements.frames",
         "calibrate.measurements.full_field",
         "calibrate.cli.commands.frames",

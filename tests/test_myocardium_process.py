@@ -8,6 +8,8 @@ from studies.sheep_myocardium import cube, process
 
 import calibrate as cal
 import emulator as em
+from emulator.fem.energy import point_energy
+from emulator.scenes.tissue import Tissue
 from emulator.specimens.states import states
 
 pytestmark = pytest.mark.slow
@@ -76,10 +78,10 @@ def test_the_formulas_fibres_miss_their_angles():
     H, C = (jnp.asarray(a)[None] for a in cube.homogeneous(amounts))
     x = position(a=1.0, b=5.0, a_f=2.0, b_f=3.0).at[8:].set(jnp.array([0.6, 0.3]))
     found = cube.formula(x[None], H, C, jnp.array([90.0]))[0]
-    stress = jax.grad(cube.point_energy(cube._law_of(), cube.theta_of(x)))
+    stress = jax.grad(point_energy(cube._law_of(), cube.theta_of(x)))
 
     def alone(x):
-        P = jax.vmap(stress, (0, None))(H.reshape(-1, 3, 3), cube.Tissue(cube.turned_to(0, x)))
+        P = jax.vmap(stress, (0, None))(H.reshape(-1, 3, 3), Tissue(cube.turned_to(0, x)))
         return 0.09 * jnp.einsum("kij,kij->k", C.reshape(-1, 3, 3), P)
 
     nodes, weights = np.polynomial.hermite_e.hermegauss(9)

@@ -26,38 +26,23 @@ QUICK = {
     "biaxial": "--quick",
     "blood_clots": "--data MEASURED/blood_clots --quick",
     "certificate": "--quick",
-    "decoder_speed": "--quick",
-    "effects": "--quick",
-    "elements": "--quick",
-    "error_bar": "--scenes once_clamped_beam --cases 3 --outside 1",
-    "fem_posterior": "--quick",
     "fem_speed": "--quick",
-    "few_runs": "--parts left_ventricle --mesh 4 8 1 --runs 1 5 --tests 3 --order 1",
     "human_heart": "--data MEASURED/human_heart --quick",
     "human_myocardium": "--data MEASURED/myocardium_tables --quick",
     "imaged_heart": "--quick",
     "inverse_benchmark": "--quick",
-    "large_meshes": "--quick",
     "living_skin": "--data MEASURED/living_skin --quick",
-    "many_solves": "--solves 3",
     "mesh_row": "--quick",
     "mesh_to_certificate": "--ventricles 1 --mesh 5 10 1",
     "networks_alone": "--quick",
-    "physics_informed": "--quick",
-    "poor_emulators": "--quick",
-    "published_pressure": "--quick",
-    "pymecht": "--quick",
     "released_networks": "--quick --published PUBLISHED",
-    "samplers": "--quick",
     "sbc": "--replicates 20 --only map",
-    "sensitivity": "--quick",
     "sheep_myocardium": "--data MEASURED/ovine_myocardium --quick",
     "silicone_beam": "--data MEASURED/silicone_beam --quick",
     "stability": "--workers 1 --cases theta_zero_inside_jit theta_too_short pushed_through_itself "
     "squeezed_to_half elements_10000_to_1 springs_1e12 twist_360_from_rest laplace_two_modes float32_once_clamped_beam "
     "outside_by_half_once_clamped_beam",
     "terms": "--quick",
-    "unloading": "--quick",
     "any_ventricle": "--quick",
     "verification": "--quick",
 }
@@ -92,13 +77,11 @@ def test_every_study_has_a_line():
 # Figures that need more than the few cases.
 FULL_ONLY = {
     "accuracy_vs_time": {"posteriors.png", "released.png"},
-    "few_runs": {"meshes.png"},
-    "sensitivity": {"segments.png"},
     "sbc": {"beam.png", "ventricle.png", "specimen.png", "noise.png", "prior.png"},
 }
 
 
-PEERS = {"human_heart": "gmsh", "pymecht": "pymecht"}
+PEERS = {"human_heart": "gmsh"}
 """Packages that a study compares with or meshes by, which a developer need not have."""
 
 

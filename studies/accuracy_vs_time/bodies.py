@@ -13,8 +13,6 @@ from typing import Any
 from studies.accuracy_vs_time.refinement import quadratic, refined
 
 import emulator as em
-from emulator.released.scenes import published_scene
-from emulator.scenes import Scene
 
 SERIES, NETWORK = "series as shipped", "graph network"
 
@@ -31,11 +29,11 @@ class Body:
     FEM. fenics : whether FEniCSx solves it, too.
     """
 
-    scene: Callable[[], Scene]
-    truth: Callable[[], Scene] | None
-    meshes: dict[str, Callable[[], Scene]]
+    scene: Callable[[], em.Scene]
+    truth: Callable[[], em.Scene] | None
+    meshes: dict[str, Callable[[], em.Scene]]
     shipped: dict[str, str] = field(default_factory=dict)
-    coarse: Callable[[], Scene] | None = None
+    coarse: Callable[[], em.Scene] | None = None
     model: str = ""
     tests: int = 10
     tolerances: tuple[float, ...] = (1e-3, 1e-6)
@@ -63,7 +61,7 @@ def of_scene(name: str) -> dict[str, str]:
     return {SERIES: f"{name}_series", NETWORK: name}
 
 
-def linear(scene: Callable[..., Scene], *sizes: Any) -> Callable[[], Scene]:
+def linear(scene: Callable[..., em.Scene], *sizes: Any) -> Callable[[], em.Scene]:
     """``scene`` in linear elements."""
     return lambda: scene(*sizes, order=1)
 
@@ -122,7 +120,7 @@ BODIES = {
         fenics=True,
     ),
 }
-_RELEASED: dict[str, tuple[str, Callable[[Scene], Scene] | None]] = {
+_RELEASED: dict[str, tuple[str, Callable[[em.Scene], em.Scene] | None]] = {
     "released cube": ("TwistingBeam", lambda scene: quadratic(refined(scene))),
     "released liver": ("Liver", quadratic),
     # The released work of the pressure is no pressure's, and not defined on quadratic tetrahedra.
@@ -139,8 +137,8 @@ def find(name: str, published: Path | None) -> Body:
         raise SystemExit(f"{name}: give --published DIR, the folder of the released data")
     model, finer = _RELEASED[name]
     return Body(
-        lambda: published_scene(model, published),
-        None if finer is None else lambda: finer(published_scene(model, published)),
+        lambda: em.released.published_scene(model, published),
+        None if finer is None else lambda: finer(em.released.published_scene(model, published)),
         {},
         model=model,
         tests=4,

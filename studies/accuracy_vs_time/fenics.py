@@ -8,14 +8,14 @@ from studies.accuracy_vs_time.rungs import CLOCK, Place
 from studies.common.fenicsx import compare
 from studies.common.output import Case
 
-from calibrate.measurements import landmarks
+import calibrate as cal
 
 STAGE = "FEniCSx"
 
 
 def examine(place: Place, known: References, python: str) -> Iterator[Case]:
     """Four rungs: ours and FEniCSx's, from rest and from a neighbour."""
-    observed = landmarks(place.scene, place.at).nodes
+    observed = cal.landmarks(place.scene, place.at).nodes
     names = (
         "FEM from rest, beside FEniCSx", "FEM from a neighbour", "FEniCSx from rest",
         "FEniCSx from a neighbour",

@@ -4,9 +4,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from studies.common.figures import pyplot
 from studies.common.output import Case, save
-
-from calibrate.figures import pyplot
 
 # Colours and shapes that differ for every reader (Okabe and Ito 2008).
 STYLES = {

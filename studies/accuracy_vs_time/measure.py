@@ -13,15 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from studies.accuracy_vs_time.rungs import CLOCK, COMPILED, Place, Rung, Solve
-from studies.common.output import Case
+from studies.common.output import Case, replacing
 from studies.common.timing import per_call, unseen
 
-from calibrate.measurements import landmarks
-from emulator.core.errors import InputError
-from emulator.core.store import replacing
-from emulator.fem import Simulator, run_campaign, sobol
-from emulator.scenes import Scene
-from emulator.surrogates.corrected import newton_step
+import calibrate as cal
+import emulator as em
 
 TEST_SEED = 90_210
 
@@ -41,7 +37,7 @@ def references(place: Place, folder: Path) -> References:
     """Those in ``folder`` if they are of this body, else new ones, which are kept there."""
     make = (lambda: place.scene) if place.quick else place.body.truth
     truth = make and make()
-    tests = sobol(place.scene, 2 if place.quick else place.body.tests, TEST_SEED)
+    tests = em.fem.sobol(place.scene, 2 if place.quick else place.body.tests, TEST_SEED)
     finest = truth.fingerprint if truth else "none"
     made_of = "/".join((place.scene.fingerprint, finest, str(len(tests))))
     path = folder / f"{place.name.replace(' ', '_')}.npz"
@@ -61,20 +57,20 @@ def references(place: Place, folder: Path) -> References:
     return found
 
 
-def solved(scene: Scene, at: np.ndarray, tests: jax.Array, *, steps: int = 0) -> np.ndarray:
+def solved(scene: em.Scene, at: np.ndarray, tests: jax.Array, *, steps: int = 0) -> np.ndarray:
     """FEM's displacements (c, d, 3) mm of the points, ``steps`` Newton steps beyond tolerance."""
-    simulator, observe = Simulator(scene), landmarks(scene, at)
-    fields = list(run_campaign(simulator, tests).displacement)
+    simulator, observe = em.Simulator(scene), cal.landmarks(scene, at)
+    fields = list(em.fem.run_campaign(simulator, tests).displacement)
     if steps:
         beyond = jax.jit(lambda u, theta: _beyond(simulator, u, theta, steps))
         fields = [beyond(u, theta) for u, theta in zip(fields, tests, strict=True)]
     return np.stack([np.asarray(observe(u[observe.nodes], None)) for u in fields])
 
 
-def _beyond(simulator: Simulator, u: jax.Array, theta: jax.Array, steps: int) -> jax.Array:
+def _beyond(simulator: em.Simulator, u: jax.Array, theta: jax.Array, steps: int) -> jax.Array:
     """``u`` (n, 3) mm after some Newton steps."""
     for _ in range(steps):
-        u = newton_step(simulator.system, u, theta)
+        u = em.newton_step(simulator.system, u, theta)
     return u
 
 
@@ -83,7 +79,7 @@ def measure(rung: Rung, place: Place, known: References) -> Case:
     try:
         with jax.enable_x64(not rung.narrow):
             return _measured(rung, place, known)
-    except InputError as error:
+    except em.InputError as error:
         return {"status": f"refused: {error}", "kind": rung.kind, "rung": rung.name}
 
 
@@ -93,7 +89,7 @@ def _measured(rung: Rung, place: Place, known: References) -> Case:
         value, gradient = jax.jit(value), jax.jit(gradient)
     found = [np.asarray(value(theta)) for theta in map(jnp.asarray, known.tests)]
     if rung.narrow and found[0].dtype != np.float32:
-        raise InputError(f"computes in {found[0].dtype}")
+        raise em.InputError(f"computes in {found[0].dtype}")
     # FEM on another mesh has no error of its own to speak of.
     own = rung.scene.fingerprint == place.scene.fingerprint
     return {
@@ -109,11 +105,17 @@ def _measured(rung: Rung, place: Place, known: References) -> Case:
 
 
 def errors(
-    scene: Scene, place: Place, known: References, found: list[np.ndarray], *, full: bool, own: bool
+    scene: em.Scene,
+    place: Place,
+    known: References,
+    found: list[np.ndarray],
+    *,
+    full: bool,
+    own: bool,
 ) -> Case:
     """Both errors of displacements at the tests, of the observed nodes or of all (``full``)."""
     with jax.enable_x64(True):  # what is measured may be in float32, what measures is not
-        observe = landmarks(scene, place.at)
+        observe = cal.landmarks(scene, place.at)
         rows = observe.nodes if full else slice(None)
         wide = [jnp.asarray(np.asarray(u, dtype=float)[rows]) for u in found]
         seen = np.stack([np.asarray(observe(u, None)) for u in wide])

@@ -9,23 +9,19 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from numpyro.infer import MCMC
+from numpyro.infer import NUTS as NUTSKernel
 from studies.accuracy_vs_time.rungs import SEED, mechanics
 from studies.common.output import Case
 from studies.inverse_benchmark import entries, reference, tables
 from studies.inverse_benchmark.problems import PROBLEMS, data_of, model, scene_of
 from studies.inverse_benchmark.score import score
-from studies.samplers.ways import NUMPYRO, ways
 
 import calibrate as cal
-from emulator.fem import Simulator, run_campaign, sobol
-from emulator.scenes import Scene
-from emulator.surrogates.emulator import Emulator
-from emulator.surrogates.fem import fem_forward
-from emulator.surrogates.pod_gp import fit_reduced
-from emulator.surrogates.protocol import ForwardMap
-from emulator.surrogates.taylor import expand
+import emulator as em
 
 PROBLEM = PROBLEMS["all_mid"]
 NUTS = entries.sampler("nuts", warmup=500, draws=1000, chains=4)
@@ -34,28 +30,34 @@ FEW = entries.sampler("nuts", warmup=150, draws=250, chains=2, rounds=1)
 
 def by_numpyro(statistical: cal.Model, data: entries.Draws) -> tuple[entries.Draws, int]:
     """NumPyro's own NUTS with a dense metric, 4 chains of 1000 draws."""
-    drawn = ways(statistical, data, 1000)[NUMPYRO](3).draws
-    columns = drawn.reshape(-1, drawn.shape[-1])
-    return dict(zip(statistical.names, columns.T, strict=True)), 0
+    run = MCMC(
+        NUTSKernel(statistical, dense_mass=True), num_warmup=1000, num_samples=1000, num_chains=4,
+        chain_method="sequential", progress_bar=False,
+    )  # fmt: skip
+    run.run(jax.random.key(3), statistical.check_data(data))
+    drawn = run.get_samples()
+    return {name: np.asarray(drawn[name]) for name in statistical.names}, 0
 
 
-def _series(order: int) -> Callable[[Scene], ForwardMap]:
-    return lambda scene: Emulator(scene, taylor=expand(Simulator(scene), order=order)).cache()
+def _series(order: int) -> Callable[[em.Scene], em.ForwardMap]:
+    return lambda scene: em.Emulator(
+        scene, taylor=em.expand(em.Simulator(scene), order=order)
+    ).cache()
 
 
-def _mechanics(runs: int) -> Callable[[Scene], ForwardMap]:
+def _mechanics(runs: int) -> Callable[[em.Scene], em.ForwardMap]:
     return lambda scene: mechanics(scene, runs).cache()
 
 
-def _reduced(runs: int) -> Callable[[Scene], ForwardMap]:
-    return lambda scene: fit_reduced(
-        scene, run_campaign(Simulator(scene), sobol(scene, runs, SEED))
+def _reduced(runs: int) -> Callable[[em.Scene], em.ForwardMap]:
+    return lambda scene: em.fit_reduced(
+        scene, em.fem.run_campaign(em.Simulator(scene), em.fem.sobol(scene, runs, SEED))
     )
 
 
-def _fem(scene: Scene) -> ForwardMap:
+def _fem(scene: em.Scene) -> em.ForwardMap:
     """FEM, started by a series of order 2: the fastest way to ask FEM itself."""
-    return fem_forward(Simulator(scene), _series(2)(scene))
+    return em.fem_forward(em.Simulator(scene), _series(2)(scene))
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,7 @@ class Way:
     """
 
     kind: str
-    make: Callable[[Scene], ForwardMap]
+    make: Callable[[em.Scene], em.ForwardMap]
     sampler: entries.Method | None = NUTS
 
 

@@ -18,17 +18,8 @@ from studies.common.maps import shipped
 from studies.common.timing import clocked
 from studies.common.two_meshes import on_two_meshes
 
+import calibrate as cal
 import emulator as em
-from calibrate.measurements import landmarks, spread_landmarks
-from emulator.core.errors import InputError
-from emulator.fem import NewtonOptions, Simulator, run_campaign, sobol
-from emulator.scenes import Scene
-from emulator.surrogates.corrected import corrected
-from emulator.surrogates.emulator import Emulator
-from emulator.surrogates.pod_gp import fit_reduced
-from emulator.surrogates.protocol import ForwardMap
-from emulator.surrogates.taylor import expand
-from emulator.training import recipe, train
 
 POINTS, SEED = 24, 4
 FAST_CALLS = 60
@@ -48,7 +39,7 @@ class Rung:
 
     name: str
     kind: str
-    scene: Scene
+    scene: em.Scene
     solve: Solve
     offline_s: float = 0.0
     fem_runs: int = 0
@@ -64,34 +55,36 @@ class Place:
 
     name: str
     body: Body
-    scene: Scene
+    scene: em.Scene
     published: Any
     quick: bool
 
     @cached_property
-    def simulator(self) -> Simulator:
-        return Simulator(self.scene)
+    def simulator(self) -> em.Simulator:
+        return em.Simulator(self.scene)
 
     @cached_property
     def at(self) -> np.ndarray:
         """The observed material points, (24, 3) mm."""
-        return spread_landmarks(self.scene, POINTS, SEED)
+        return cal.spread_landmarks(self.scene, POINTS, SEED)
 
     def some(self, values: tuple) -> tuple:
         """The first of ``values`` where few are asked for."""
         return values[:1] if self.quick else values
 
 
-def of_map(name: str, kind: str, forward: ForwardMap, at: np.ndarray, **more: Any) -> Rung:
+def of_map(name: str, kind: str, forward: em.ForwardMap, at: np.ndarray, **more: Any) -> Rung:
     """A forward map decoded at the observed points' nodes."""
-    return Rung(name, kind, forward.scene, forward.at(landmarks(forward.scene, at).nodes), **more)
+    return Rung(
+        name, kind, forward.scene, forward.at(cal.landmarks(forward.scene, at).nodes), **more
+    )
 
 
 def of_fem(
-    name: str, simulator: Simulator, place: Place, start: Solve | None = None, **more: Any
+    name: str, simulator: em.Simulator, place: Place, start: Solve | None = None, **more: Any
 ) -> Rung:
     """FEM called from Python, from rest or started by a compiled map of the whole field."""
-    nodes, begin = landmarks(simulator.scene, place.at).nodes, start and jax.jit(start)
+    nodes, begin = cal.landmarks(simulator.scene, place.at).nodes, start and jax.jit(start)
 
     def solve(theta: jax.Array) -> jax.Array:
         first = None if begin is None else begin(jax.lax.stop_gradient(theta))
@@ -106,7 +99,9 @@ def from_rest(place: Place) -> Iterator[Rung]:
     """FEM from rest, by tolerance."""
     yield of_fem("FEM from rest", place.simulator, place)
     for tolerance in place.some(place.body.tolerances):
-        loose = Simulator(place.scene, NewtonOptions(tolerance=tolerance, round_off=tolerance))
+        loose = em.Simulator(
+            place.scene, em.fem.NewtonOptions(tolerance=tolerance, round_off=tolerance)
+        )
         yield of_fem(f"FEM from rest, tolerance {tolerance:g}", loose, place)
 
 
@@ -147,13 +142,13 @@ def loaded(place: Place) -> Iterator[Rung]:
             uncached = em.load(name)
             yield Rung(f"{label}, full field", kind, place.scene, made.forward, full=True, **before)
             yield with_processor(f"{label}, processor in every call", uncached, place, before)
-            polished = corrected(made.forward, place.simulator, steps=1)
+            polished = em.corrected(made.forward, place.simulator, steps=1)
             yield of_map(f"{label} + 1 Newton step", "polished", polished, place.at, **before)
 
 
-def with_processor(name: str, emulator: Emulator, place: Place, before: dict[str, Any]) -> Rung:
+def with_processor(name: str, emulator: em.Emulator, place: Place, before: dict[str, Any]) -> Rung:
     """A graph network without its cache; its weights are arguments, so that nothing is folded."""
-    nodes, network = landmarks(place.scene, place.at).nodes, emulator.network
+    nodes, network = cal.landmarks(place.scene, place.at).nodes, emulator.network
     assert network is not None
 
     @jax.jit
@@ -184,7 +179,7 @@ def released(place: Place) -> Iterator[Rung]:
 
 
 def standing_on(
-    name: str, best: ForwardMap, place: Place, offline: dict[str, Any]
+    name: str, best: em.ForwardMap, place: Place, offline: dict[str, Any]
 ) -> Iterator[Rung]:
     """The full field of a map, FEM started by it, and Newton steps from it."""
     kind = "emulator" if name == "emulator" else "network"
@@ -192,7 +187,7 @@ def standing_on(
     yield of_fem(f"FEM started by the {name}", place.simulator, place, best, **offline)
     small = len(place.scene.mesh.nodes) < COMPILED
     for steps in (1, 2) if small else (1,):
-        polished = corrected(best, place.simulator, steps=steps)
+        polished = em.corrected(best, place.simulator, steps=steps)
         label = f"{name} + {steps} Newton step{'s' if steps > 1 else ''}"
         rung = of_map(label, "polished", polished, place.at, **offline)
         yield replace(rung, compiled=small, calls=rung.calls if small else place.body.calls)
@@ -201,12 +196,12 @@ def standing_on(
 def other_meshes(place: Place) -> Iterator[Rung]:
     """FEM on coarser, finer and quadratic meshes."""
     for label, make in place.body.meshes.items():
-        yield of_fem(f"FEM, {label}", Simulator(make()), place)
+        yield of_fem(f"FEM, {label}", em.Simulator(make()), place)
 
 
 def float32(place: Place) -> Iterator[Rung]:
     """Maps made in float64 and evaluated in float32; those that need float64 refuse."""
-    makes: dict[str, tuple[str, Callable[[], ForwardMap]]] = {
+    makes: dict[str, tuple[str, Callable[[], em.ForwardMap]]] = {
         "series of order 3": ("series", lambda: _series(place, 3)[1]),
         "POD + GP, 30 FEM runs": ("POD + GP", lambda: _reduced(place, 30)),
     }
@@ -230,7 +225,7 @@ def float32(place: Place) -> Iterator[Rung]:
         with jax.enable_x64(False):
             try:
                 rung = of_map(name, kind, forward, place.at, narrow=True)
-            except InputError as error:
+            except em.InputError as error:
                 rung = Rung(name, kind, place.scene, _refusing(error), narrow=True)
         yield rung
 
@@ -248,23 +243,23 @@ STAGES: dict[str, Callable[[Place], Iterator[Rung]]] = {
 }
 
 
-def mechanics(scene: Scene, runs: int) -> Emulator:
+def mechanics(scene: em.Scene, runs: int) -> em.Emulator:
     """A series of order 3 and a discrepancy model of so many FEM runs."""
     with TemporaryDirectory() as folder:
-        return train(scene, replace(recipe("mechanics"), simulations=runs), folder)
+        return em.train(scene, replace(em.recipe("mechanics"), simulations=runs), folder)
 
 
-def _series(place: Place, order: int) -> tuple[float, ForwardMap]:
-    seconds, taylor = clocked(lambda: expand(place.simulator, order=order), clock=CLOCK)
-    return seconds, Emulator(place.scene, taylor=taylor).cache()
+def _series(place: Place, order: int) -> tuple[float, em.ForwardMap]:
+    seconds, taylor = clocked(lambda: em.expand(place.simulator, order=order), clock=CLOCK)
+    return seconds, em.Emulator(place.scene, taylor=taylor).cache()
 
 
-def _reduced(place: Place, runs: int) -> ForwardMap:
-    campaign = run_campaign(place.simulator, sobol(place.scene, runs, SEED))
-    return fit_reduced(place.scene, campaign)
+def _reduced(place: Place, runs: int) -> em.ForwardMap:
+    campaign = em.fem.run_campaign(place.simulator, em.fem.sobol(place.scene, runs, SEED))
+    return em.fit_reduced(place.scene, campaign)
 
 
-def _refusing(error: InputError) -> Solve:
+def _refusing(error: em.InputError) -> Solve:
     """A map that refuses as it was refused."""
 
     def solve(theta: jax.Array) -> jax.Array:  # noqa: ARG001 - whatever it is

@@ -17,25 +17,18 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from studies.any_ventricle.bodies import test_bodies
 from studies.any_ventricle.figures import draw
 from studies.any_ventricle.judge import one, swept
-from studies.any_ventricle.learned import error_of
 from studies.any_ventricle.posteriors import first_posterior
 from studies.any_ventricle.runs import GROUPS, RUNS_A_BODY, body_runs
-from studies.any_ventricle.training import PLAN, family_of, fingerprint_of, train_family
-from studies.common.output import Case, Results, parser
+from studies.common.output import Case, Results, hardware, parser, versions
 
-from calibrate.provenance import hardware, versions
-from emulator.scenes.built_in.ventricles import left_ventricle
-from emulator.surrogates import Emulator, save_emulator
-from emulator.surrogates.network.family import FamilyNetwork
+import emulator as em
 
 HERE = Path(__file__).parent
 SEED, TESTS = 0, 5
@@ -59,30 +52,29 @@ def train(given: argparse.Namespace) -> None:
         for group, numbers in LEARNED.items()
         for each in body_runs(given.runs, group, numbers, progress=True)
     ]
-    home, digest = left_ventricle(), fingerprint_of(runs)
-    family = family_of(runs, GROUPS["ordinary"].bodies()[0].scene())
-    members: list[Any] = []
-    seconds, steps = 0.0, given.steps
+    home, digest = em.scenes.left_ventricle(), em.families.digest_of(runs)
+    family = em.families.family_of(runs, GROUPS["ordinary"].bodies()[0].scene())
+    trained = []
     for seed in range(MEMBERS) if given.member is None else (given.member,):
-        plan, folder = replace(PLAN, steps=steps, seed=seed), given.out / f"member_{seed}"
-        trained = train_family(
-            family, digest, plan, folder, home, progress=True, resume=given.resume
+        plan = em.families.FamilyPlan(steps=given.steps, seed=seed)
+        folder = given.out / f"member_{seed}"
+        resume = given.resume and folder.is_dir()
+        trained.append(
+            em.families.train_family(
+                family, digest, plan, folder, home, progress=True, resume=resume
+            )
         )
-        assert trained.family is not None
-        members += trained.family.learned.members
-        seconds += trained.record["seconds"]
     if given.member is not None:
         return
-    part = FamilyNetwork(family.learned._replace(members=tuple(members)), home)
     record = {
-        **trained.record,
-        "seconds": seconds,
+        **trained[-1].record,
+        "seconds": sum(member.record["seconds"] for member in trained),
         "command": "python -m studies.any_ventricle --train --runs DIR --out DIR",
         "fem_runs": len(runs) * RUNS_A_BODY,
         "hardware": hardware(),
         "versions": versions(),
     }
-    save_emulator(Emulator(home, family=part, record=record), given.out / "ventricle_family")
+    em.save_emulator(em.families.ensemble(trained, record), given.out / "ventricle_family")
 
 
 def learned_from(count: int, given: argparse.Namespace) -> Case:
@@ -90,12 +82,11 @@ def learned_from(count: int, given: argparse.Namespace) -> Case:
     numbers = range(CURVE_WATCHED, CURVE_WATCHED + count)
     runs = body_runs(given.runs, "ordinary", numbers, progress=True)
     watched = body_runs(given.runs, "ordinary", range(CURVE_WATCHED))
-    family = family_of(runs, GROUPS["ordinary"].bodies()[0].scene())
-    plan = replace(PLAN, steps=CURVE_STEPS)
+    family = em.families.family_of(runs, GROUPS["ordinary"].bodies()[0].scene())
+    plan, home = em.families.FamilyPlan(steps=CURVE_STEPS), em.scenes.left_ventricle()
     with tempfile.TemporaryDirectory() as folder:
-        emulator = train_family(family, "", plan, folder, left_ventricle(), progress=True)
-    assert emulator.family is not None
-    errors = [error_of(emulator.family.learned, each) for each in watched]
+        trained = em.families.train_family(family, "", plan, folder, home, progress=True)
+    errors = [em.families.median_error(trained, each) for each in watched]
     return {"bodies": count, "steps": CURVE_STEPS, "err_u_mm": float(np.median(errors))}
 
 
@@ -105,7 +96,7 @@ def main() -> None:
     arguments.add_argument("--train", action="store_true", help="solve the family and train on it")
     arguments.add_argument("--curve", action="store_true", help="train on parts of the family")
     arguments.add_argument("--runs", type=Path, help="folder of the FEM runs to train on")
-    arguments.add_argument("--steps", type=int, default=PLAN.steps)
+    arguments.add_argument("--steps", type=int, default=em.families.FamilyPlan.steps)
     arguments.add_argument("--member", type=int, help="train this one of the networks alone")
     arguments.add_argument("--resume", action="store_true", help="go on from the checkpoint")
     arguments.add_argument("--sweeps", type=int, default=0, help="bodies to sweep from the network")

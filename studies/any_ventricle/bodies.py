@@ -7,28 +7,23 @@ from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from studies.any_ventricle.shapes import USUAL, Body, bodies
 
-from emulator.geometry.facets import flat_triangles
-from emulator.geometry.mesh import Mesh
-from emulator.hearts.heart import Wall, mesh_wall
-from emulator.hearts.surfaces import Surface
-from emulator.scenes.built_in.ventricles import MYOCARDIUM, PRESSURE
-from emulator.scenes.fibre_rules import Helix
-from emulator.scenes.scene import Scene
+import emulator as em
 
-BOX = (*MYOCARDIUM, PRESSURE)
+BOX = em.scenes.left_ventricle(3, 6, 1).parameters
 """The built-in ventricle's: 4 to 10 mmHg."""
 HEART = Path(__file__).parents[2].parent / "shared" / "measured" / "human_heart"
 FRAMES = {"human, end of diastole": "000", "human, diastasis": "018"}
 _MESHES = {"coarser": (6, 18, 2), "finer": (10, 30, 3)}
 
 
-def test_bodies(count: int) -> dict[str, Callable[[], Scene]]:
+def test_bodies(count: int) -> dict[str, Callable[[], em.Scene]]:
     """The scenes by name, made when they are called."""
-    found: dict[str, Callable[[], Scene]] = {}
+    found: dict[str, Callable[[], em.Scene]] = {}
     for kind, seed, share in (("ellipsoid", 1, 0.0), ("irregular", 2, 1.0)):
         for k, body in enumerate(bodies(count, seed, share)):
             found[f"{kind} {k}"] = partial(body.scene, 2, BOX)
@@ -44,32 +39,36 @@ def test_bodies(count: int) -> dict[str, Callable[[], Scene]]:
     return found
 
 
-def human(frame: str) -> Scene:
+def human(frame: str) -> em.Scene:
     """The left ventricle of the measured heart, its surfaces of ``frame`` taken as at rest."""
     names = ("LV_ENDOCARDIAL", "EPICARDIAL", "RV_ENDOCARDIAL")
     inner, outer, right = (HEART / f"{name}_{frame}.obj" for name in names)
-    return _scene("human", mesh_wall(inner, outer, right=right, ventricles="left"), (60.0, -60.0))
+    return _scene(
+        "human", em.hearts.mesh_wall(inner, outer, right=right, ventricles="left"), (60.0, -60.0)
+    )
 
 
-def meshed_by_gmsh(body: Body) -> Scene:
+def meshed_by_gmsh(body: Body) -> em.Scene:
     """The scene of ``body``, its surfaces meshed anew as those of a scanned heart are."""
     mesh = body.scene().mesh
     surfaces = (_surface(mesh, name) for name in ("endocardium", "epicardium"))
-    return _scene("gmsh", mesh_wall(*surfaces), body.angles)
+    return _scene("gmsh", em.hearts.mesh_wall(*surfaces), body.angles)
 
 
-def _surface(mesh: Mesh, name: str) -> Surface:
+def _surface(mesh: em.Mesh, name: str) -> em.hearts.Surface:
     """A surface of a wall, of flat triangles between all its nodes."""
-    facets = flat_triangles(mesh.facet_set(name))
+    facets = mesh.facet_set(name)
+    if mesh.order == 2:  # corners, then the middles of 01, 12 and 20
+        facets = facets[:, [[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]]].reshape(-1, 3)
     used, triangles = np.unique(facets, return_inverse=True)
     triangles = triangles.reshape(facets.shape)
     inside = name == "endocardium"  # the tissue's normals point into the cavity
-    return Surface(name, mesh.nodes[used], triangles[:, ::-1] if inside else triangles)
+    return em.hearts.Surface(name, mesh.nodes[used], triangles[:, ::-1] if inside else triangles)
 
 
-def _scene(name: str, wall: Wall, angles: tuple[float, float]) -> Scene:
+def _scene(name: str, wall: Any, angles: tuple[float, float]) -> em.Scene:
     axis = tuple(np.asarray(wall.axis).tolist())
-    rule = Helix(angles, axis=axis)
+    rule = em.scenes.Helix(angles, axis=axis)
     return replace(
         USUAL,
         name=name,

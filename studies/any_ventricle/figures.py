@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from studies.common.figures import BLACK, BLUE, GREEN, VERMILION, pyplot
 from studies.common.output import Case, save
-
-from calibrate.figures import BLACK, BLUE, GREEN, VERMILION, pyplot
 
 KINDS = ("ellipsoid", "irregular", "coarser", "finer", "gmsh", "human")
 WAYS = {

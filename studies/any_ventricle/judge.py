@@ -13,19 +13,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from studies.common.arrays import read_arrays, save_arrays
 
 import emulator as em
-from emulator.accuracy.comparison import case_errors, quantiles
-from emulator.core.errors import SolverError
-from emulator.core.store import read_arrays, save_arrays
-from emulator.fem.campaign import Runs, run_campaign
-from emulator.fem.campaign.designs import design, sobol
-from emulator.scenes.scene import Scene
-from emulator.surrogates import Emulator, load
-from emulator.surrogates.pod_gp import fit_reduced
-from emulator.surrogates.taylor import expand_at
-from emulator.training import recipe
-from emulator.training import train as train_emulator
 
 NETWORK = "ventricle_family"
 THETA_SEED = 90_210
@@ -34,16 +24,16 @@ KEYS = ("err_u", "err_V")
 _POD_RUNS = 20
 
 
-def first_prediction(scene: Scene) -> tuple[Emulator, float]:
+def first_prediction(scene: em.Scene) -> tuple[em.Emulator, float]:
     """The network on ``scene``, and the seconds to its first displacement."""
     began = time.perf_counter()
-    emulator = load(NETWORK, scene)
+    emulator = em.load(NETWORK, scene)
     jax.block_until_ready(emulator.cache()(scene.centre))
     return emulator, time.perf_counter() - began
 
 
 def one(
-    make: Callable[[], Scene], number: int, tests: int, more: tuple[bool, bool], kept: Path
+    make: Callable[[], em.Scene], number: int, tests: int, more: tuple[bool, bool], kept: Path
 ) -> dict[str, Any]:
     """All about one ventricle.
 
@@ -70,10 +60,10 @@ def one(
 
 
 def references(
-    scene: Scene, number: int, tests: int, more: tuple[bool, bool], kept: Path
-) -> tuple[Runs, dict[str, Any]]:
+    scene: em.Scene, number: int, tests: int, more: tuple[bool, bool], kept: Path
+) -> tuple[em.fem.Runs, dict[str, Any]]:
     """FEM's solutions at ``tests`` theta, and what needs no network; read where it is kept."""
-    thetas = sobol(scene, tests, THETA_SEED + number)
+    thetas = em.fem.sobol(scene, tests, THETA_SEED + number)
     if kept.is_file():
         arrays, metadata = read_arrays(kept)
         return _runs(thetas, arrays["u"]), json.loads(metadata["row"])
@@ -87,39 +77,38 @@ def references(
         "factorisations_from_rest": [int(solution.factorisations) for solution in rest],
     }
     if more[0]:
-        centre = simulator(scene.centre)
-        series = Emulator(scene, taylor=expand_at(simulator, centre, scene.centre, 3))
+        series = em.Emulator(scene, taylor=em.expand(simulator, order=3))
         row["one_run"] = judged(series.cache(), known)
     if more[1]:
-        every = jnp.concatenate([scene.centre[None], design(scene, _POD_RUNS - 1, 0)])
-        row["pod_gp"] = judged(fit_reduced(scene, run_campaign(simulator, every)), known)
+        every = jnp.concatenate([scene.centre[None], em.fem.design(scene, _POD_RUNS - 1, 0)])
+        row["pod_gp"] = judged(em.fit_reduced(scene, em.fem.run_campaign(simulator, every)), known)
     kept.parent.mkdir(parents=True, exist_ok=True)
     save_arrays(kept, {"u": np.asarray(u)}, {"row": json.dumps(row)})
     return known, row
 
 
-def _runs(thetas: jax.Array, u: Any) -> Runs:
+def _runs(thetas: jax.Array, u: Any) -> em.fem.Runs:
     """Runs without energies, which no error here asks for."""
-    return Runs(thetas, jnp.asarray(u), jnp.zeros(len(thetas)))
+    return em.fem.Runs(thetas, jnp.asarray(u), jnp.zeros(len(thetas)))
 
 
-def judged(forward: Any, known: Runs) -> dict[str, dict[str, float]]:
+def judged(forward: Any, known: em.fem.Runs) -> dict[str, dict[str, float]]:
     """Quantiles of the errors against FEM, over nodes and theta."""
-    fields = case_errors(forward, known.theta, known.displacement).fields
-    return {key: quantiles(fields[key]) for key in KEYS}
+    errors = em.evaluate(forward, known.theta, known.displacement)
+    return {key: errors[key] for key in KEYS}
 
 
-def swept(make: Callable[[], Scene], number: int, tests: int, kept: Path) -> dict[str, Any]:
+def swept(make: Callable[[], em.Scene], number: int, tests: int, kept: Path) -> dict[str, Any]:
     """Sweeps that begin where the network says: few of them, then many where those are refused."""
     scene = make()
     known, _ = references(scene, number, tests, (False, False), kept)
     rows: list[dict[str, Any]] = []
     for sweeps in SWEEPS:
-        plan, began = replace(recipe("sweeps"), sweeps=sweeps), time.perf_counter()
+        plan, began = replace(em.recipe("sweeps"), sweeps=sweeps), time.perf_counter()
         with tempfile.TemporaryDirectory() as folder:
             try:
-                emulator = train_emulator(scene, plan, folder, start=load(NETWORK))
-            except SolverError as refusal:  # too few sweeps, and told so
+                emulator = em.train(scene, plan, folder, start=em.load(NETWORK))
+            except em.SolverError as refusal:  # too few sweeps, and told so
                 rows.append({"sweeps": sweeps, "refused": str(refusal)})
                 continue
         seconds = round(time.perf_counter() - began, 1)

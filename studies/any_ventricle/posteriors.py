@@ -14,21 +14,15 @@ from studies.common.twins import twin
 
 import calibrate as cal
 import emulator as em
-from calibrate.posterior.diagnosis import map_fault
-from calibrate.statistical_model.errors import map_errors
-from emulator.scenes.scene import Scene
-from emulator.surrogates import Emulator, load
-from emulator.surrogates.taylor import expand
 
 OBSERVE, NOISE = "landmarks:24+volume", {"displacement": 1.0, "volume": 3.0}  # mm, mL
 DRAWS = 40
 
 
-def first_posterior(make: Callable[[], Scene], number: int, tests: int, kept: Path) -> Any:
+def first_posterior(make: Callable[[], em.Scene], number: int, tests: int, kept: Path) -> Any:
     """The posterior of FEM's data at one theta by the network, and by a series that FEM certifies.
 
-    The means' moves are in sd of the latter. The network's own error bar is what
-    ``infer --no-certify`` says.
+    The means' moves are in sd of the latter.
     """
     scene = make()
     known, _ = references(scene, number, tests, (False, False), kept)
@@ -36,10 +30,9 @@ def first_posterior(make: Callable[[], Scene], number: int, tests: int, kept: Pa
     observe, noises, data = twin(scene, OBSERVE, NOISE, theta, u, number)
     simulator = em.Simulator(scene)
     began = time.perf_counter()
-    first = cal.sample(cal.model(load(NETWORK, scene).cache(), observe, noises), data)
+    first = cal.sample(cal.model(em.load(NETWORK, scene).cache(), observe, noises), data)
     seconds = time.perf_counter() - began
-    bar = map_errors(first.model, simulator, first.draws(), first.data)
-    series = Emulator(scene, taylor=expand(simulator, order=3))
+    series = em.Emulator(scene, taylor=em.expand(simulator, order=3))
     better = cal.sample(cal.model(series.cache(), observe, noises), data, predictions=False)
     certificate = cal.certify(better, simulator, draws=DRAWS, mesh=0)
     ours, theirs = first.summary(), better.summary()
@@ -49,9 +42,6 @@ def first_posterior(make: Callable[[], Scene], number: int, tests: int, kept: Pa
         "seconds_to_posterior": round(seconds, 1),
         "moved_sd": moves,
         "largest_move_sd": float(np.max(np.abs(list(moves.values())))),
-        "error_bar_noise_sd": bar.sizes,
-        "error_bar_moves_sd": bar.moves if np.isfinite(bar.moves) else None,
-        "warned": map_fault(*bar) is not None,
         "certified": certificate.verdict,
         "reason": certificate.reason,
         "certified_move_sd": {n: f.value for n, f in certificate.evidence.draws.shift.items()},

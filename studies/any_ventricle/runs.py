@@ -12,13 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import qmc
 from studies.any_ventricle.shapes import ORDINARY, PARAMETERS, THIN, Body, Kind, bodies
-from studies.any_ventricle.training import BodyRuns
+from studies.common.arrays import read_arrays, save_arrays
+from tqdm import tqdm
 
 import emulator as em
-from emulator.core.display import counting
-from emulator.core.store import read_arrays, save_arrays
-from emulator.scenes.scene import Scene
-from emulator.surrogates.network.body import describe
 
 MOST = 1024
 """The number of bodies of a group of which the first so many are taken."""
@@ -47,7 +44,7 @@ _kept: dict[Any, em.Simulator] = {}  # one a topology, so that bodies share its 
 
 def body_runs(
     folder: Path, group: str, numbers: Sequence[int], *, progress: bool = False
-) -> list[BodyRuns]:
+) -> list[em.families.BodyRuns]:
     """The runs of the bodies ``numbers`` of a group with FEM's slopes in the unit box.
 
     folder : where the group's folder is. What is not there is solved.
@@ -58,7 +55,7 @@ def body_runs(
     bits = (MOST * RUNS_A_BODY - 1).bit_length()
     points = qmc.Sobol(len(PARAMETERS), rng=GROUPS[group].seed + 1000).random_base2(bits)
     found = []
-    for k in counting(numbers, "bodies", disable=not progress):
+    for k in tqdm(numbers, "bodies", disable=not progress):
         path, scene = folder / f"{k:04d}.safetensors", made[k].scene()
         if not path.is_file():
             if k % _CLEARED == 0:
@@ -68,11 +65,13 @@ def body_runs(
         arrays, _ = read_arrays(path)
         if len(arrays["position"]) == RUNS_A_BODY:  # equally many of each
             held = scene.held.all(axis=1)
-            found.append(BodyRuns(describe(scene), scene.mesh, held, **arrays))
+            found.append(
+                em.families.BodyRuns(em.families.describe(scene), scene.mesh, held, **arrays)
+            )
     return found
 
 
-def _solved(scene: Scene, positions: np.ndarray) -> dict[str, np.ndarray]:
+def _solved(scene: em.Scene, positions: np.ndarray) -> dict[str, np.ndarray]:
     """Displacements and slopes of one body; runs that fail are left out."""
     simulator = em.Simulator(scene)
     _kept.setdefault(scene.mesh.elements.tobytes(), simulator)

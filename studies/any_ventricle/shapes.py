@@ -14,12 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import norm, qmc
 
-from emulator.geometry.generators.ellipsoid import EllipsoidalWall, truncated_ellipsoid
-from emulator.scenes.built_in.ventricles import left_ventricle
-from emulator.scenes.fibre_rules import Helix
-from emulator.scenes.loads import KPA_PER_MMHG
-from emulator.scenes.parameter_space import Parameter
-from emulator.scenes.scene import Scene
+import emulator as em
 
 RANGES = {
     "cavity": (60.0, 190.0),
@@ -79,11 +74,11 @@ THIN = Kind(
 a mesh generator makes them."""
 
 PARAMETERS = (
-    Parameter("a", "kPa", 0.16, 0.65, "log"),
-    Parameter("b", "", 0.8, 5.2, "log"),
-    Parameter("a_f", "kPa", 2.4, 13.0, "log"),
-    Parameter("b_f", "", 0.8, 5.6, "log"),
-    Parameter("pressure", "kPa", 0.0, 11.0 * KPA_PER_MMHG),
+    em.Parameter("a", "kPa", 0.16, 0.65, "log"),
+    em.Parameter("b", "", 0.8, 5.2, "log"),
+    em.Parameter("a_f", "kPa", 2.4, 13.0, "log"),
+    em.Parameter("b_f", "", 0.8, 5.6, "log"),
+    em.Parameter("pressure", "kPa", 0.0, 11.0 * em.loads.KPA_PER_MMHG),
 )
 """The box to train on: a quarter wider than the built-in ventricle's, and down to no pressure."""
 
@@ -98,7 +93,7 @@ class IrregularWall:
     bend : by how far the apex lies beside the axis, (2,) mm. tilt : slopes of the base plane, (2,).
     """
 
-    ellipsoid: EllipsoidalWall
+    ellipsoid: em.generators.EllipsoidalWall
     section: np.ndarray
     thickness: np.ndarray
     bend: np.ndarray
@@ -127,7 +122,7 @@ def _waves(amplitudes: np.ndarray, r: np.ndarray, phi: np.ndarray) -> np.ndarray
     return total
 
 
-USUAL = left_ventricle(7, 20, 1)
+USUAL = em.scenes.left_ventricle(7, 20, 1)
 """Its law, constants, loads and supports are every body's."""
 
 
@@ -135,18 +130,18 @@ USUAL = left_ventricle(7, 20, 1)
 class Body:
     """A ventricle of the family: its wall, mesh and helix angles."""
 
-    wall: EllipsoidalWall | IrregularWall
+    wall: em.generators.EllipsoidalWall | IrregularWall
     rings: int
     around: int
     layers: int
     angles: tuple[float, float]
 
-    def scene(self, order: int = 2, box: tuple[Parameter, ...] = PARAMETERS) -> Scene:
+    def scene(self, order: int = 2, box: tuple[em.Parameter, ...] = PARAMETERS) -> em.Scene:
         """The scene of this body with the parameters ``box``."""
-        mesh = truncated_ellipsoid(
+        mesh = em.generators.truncated_ellipsoid(
             self.wall, self.rings, self.around, self.layers, order, grading=1.5
         )
-        rule = Helix(self.angles)
+        rule = em.scenes.Helix(self.angles)
         return replace(
             USUAL,
             name="ventricle",
@@ -179,7 +174,7 @@ def _body(point: np.ndarray, seed: tuple[int, int], irregular: float, kind: Kind
     rng = np.random.default_rng(seed)
     least, largest = kind.amplitudes
     factor = least + (largest - least) * rng.random() if largest > least else least
-    wall: EllipsoidalWall | IrregularWall = EllipsoidalWall(*sizes)
+    wall: em.generators.EllipsoidalWall | IrregularWall = em.generators.EllipsoidalWall(*sizes)
     if point[-2] < irregular:
         wall = IrregularWall(
             wall,

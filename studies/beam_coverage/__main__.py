@@ -14,15 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from studies.common.output import study_header
+from studies.common.figures import pyplot
+from studies.common.output import study_header, write_json
+from studies.common.twins import spread_nodes
 
 import calibrate as cal
 import emulator as em
-from calibrate.figures import pyplot
-from calibrate.measurements import spread_nodes
-from emulator import Simulator
-from emulator.core.store import write_json
-from emulator.released.scenes import published_tests
 
 HERE = Path(__file__).parent
 SEED = 50
@@ -35,10 +32,10 @@ def study(root: Path, count: int) -> list[dict[str, Any]]:
     scene = em.scenes.once_clamped_beam(order=1)  # the released mesh
     with tempfile.TemporaryDirectory() as folder:
         emulator = em.train(scene, em.recipe("mechanics"), folder)
-    thetas, tests = published_tests(MODEL, root)
+    thetas, tests = em.released.published_tests(MODEL, root)
     observe = cal.nodal_displacements(scene, spread_nodes(scene, 20, SEED))
     model = cal.model(emulator.cache(), observe, cal.GaussianNoise(sd=NOISE))
-    simulator = Simulator(scene)
+    simulator = em.Simulator(scene)
     rows = []
     for k in range(count):
         begin = time.perf_counter()

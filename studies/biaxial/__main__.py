@@ -16,16 +16,11 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from studies.common.figures import BLUE, ORANGE, pyplot
 from studies.common.output import Case, Results, parser, save
 
 import calibrate as cal
 import emulator as em
-from calibrate.figures import BLUE, ORANGE, pyplot
-from emulator.fem.campaign.designs import sobol
-from emulator.specimens.gripped import GrippedSpecimen, learn_grips
-from emulator.specimens.grips import Grips, GripStresses
-from emulator.specimens.specimen import Specimen, specimen
-from emulator.specimens.states import states
 
 HERE = Path(__file__).parent
 SEED = 5
@@ -41,7 +36,9 @@ LEVEL = 0.9
 LIMIT = 0.5  # posterior sd, beyond which the certificate refuses
 
 
-def scene_of(size: float, learned: GripStresses | None = None) -> Specimen:
+def scene_of(
+    size: float, learned: em.specimens.GripStresses | None = None
+) -> em.specimens.Specimen:
     """The specimen: three tests, to equal strains and to half as much along one axis."""
     half, count = 1.0 + 0.5 * (STRETCHES - 1.0), len(STRETCHES)
     columns = {
@@ -51,27 +48,30 @@ def scene_of(size: float, learned: GripStresses | None = None) -> Specimen:
     names = [name for name in ("equal", "x twice", "y twice") for _ in range(count)]
     law = em.find_law("holzapfel_gasser_ogden")
     units = {quantity.name: quantity.unit for quantity in law.quantities}
-    return specimen(
-        states(columns, names), name=f"wall of {size:g} mm", law=law, constants=CONSTANTS,
+    return em.specimen(
+        em.specimens.states(columns, names), name=f"wall of {size:g} mm",
+        law=law, constants=CONSTANTS,
         parameters=tuple(em.Parameter(n, units[n], *r, "log") for n, r in RANGES.items()),
         fibres=[1.0, 0.0, 0.0], sheets=[0.0, 1.0, 0.0],
-        grips=Grips((size, size, THICKNESS), "hooks", HOOKS, marks=MARKS, learned=learned),
+        grips=em.specimens.Grips(
+            (size, size, THICKNESS), "hooks", HOOKS, marks=MARKS, learned=learned
+        ),
     )  # fmt: skip
 
 
 @lru_cache
-def gripped(size: float) -> GrippedSpecimen:
+def gripped(size: float) -> em.specimens.GrippedSpecimen:
     """FEM of the piece."""
-    return GrippedSpecimen(scene_of(size))
+    return em.specimens.GrippedSpecimen(scene_of(size))
 
 
 @lru_cache
-def learned(size: float, runs: int) -> GripStresses:
+def learned(size: float, runs: int) -> em.specimens.GripStresses:
     """What its grips do."""
-    return learn_grips(gripped(size).specimen, runs, seed=SEED, progress=True)
+    return em.specimens.learn_grips(gripped(size).specimen, runs, seed=SEED, progress=True)
 
 
-def model_of(scene: Specimen) -> cal.Model:
+def model_of(scene: em.specimens.Specimen) -> cal.Model:
     """Independent errors of the stresses along x and y; stresses of homogeneous states, or more."""
     observe = cal.stresses(scene, "stress_x,stress_y")
     return cal.model(
@@ -86,7 +86,7 @@ def twin(size: float, theta: jnp.ndarray, seed: int) -> dict[str, np.ndarray]:
     return {"stress": P + NOISE * np.random.default_rng([SEED, seed]).normal(size=P.shape)}
 
 
-def sampled(scene: Specimen, data: dict[str, np.ndarray]) -> cal.Posterior:
+def sampled(scene: em.specimens.Specimen, data: dict[str, np.ndarray]) -> cal.Posterior:
     """The posterior by the default sampler."""
     return cal.sample(model_of(scene), data, seed=SEED, predictions=False)
 
@@ -106,7 +106,7 @@ def in_units(posterior: cal.Posterior) -> tuple[np.ndarray, np.ndarray]:
 
 def of_row(size: float, number: int, runs: int) -> Case:
     """The shift that the certificate's row predicts, and the one of the gripped posterior."""
-    theta = sobol(gripped(size).specimen, 64, SEED)[number]
+    theta = em.fem.sobol(gripped(size).specimen, 64, SEED)[number]
     data = twin(size, theta, number)
     plain = sampled(gripped(size).specimen, data)
     certificate = cal.certify(plain, em.homogeneous(gripped(size).specimen), seed=SEED)

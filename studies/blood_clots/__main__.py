@@ -15,15 +15,11 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from studies.common.figures import BLUE, ORANGE, pyplot
 from studies.common.output import Case, Results, parser, run, save
 
 import calibrate as cal
 import emulator as em
-from calibrate.figures import BLUE, ORANGE, pyplot
-from calibrate.posterior.predictions import replicates
-from emulator.core.errors import InputError
-from emulator.specimens.grips import Grips
-from emulator.specimens.states import states
 
 HERE = Path(__file__).parent
 SEED = 4
@@ -45,10 +41,10 @@ NOISE = cal.CorrelatedNoise(length=0.1, sd=0.003, spatial_sd=0.02)  # kPa
 Clots = dict[str, np.ndarray]
 
 
-def model_of_clots(grips: Grips | None = None) -> cal.Model:
+def model_of_clots(grips: em.specimens.Grips | None = None) -> cal.Model:
     """The stresses of a clot at all amounts of shear."""
     held = np.ones(len(AMOUNTS))
-    given = states({"shear_xz": AMOUNTS, "stretch_x": held, "stretch_z": held})
+    given = em.specimens.states({"shear_xz": AMOUNTS, "stretch_x": held, "stretch_z": held})
     scene = em.specimen(
         given, name="clot", law=em.find_law("ogden_2"), parameters=PARAMETERS,
         constants={"alpha_2": ALPHA_2, "kappa": 500.0}, grips=grips,
@@ -60,7 +56,7 @@ def model_of_clots(grips: Grips | None = None) -> cal.Model:
 def read(path: Path) -> np.ndarray:
     """Shear and normal stress (m, 2) in kPa at the amounts of shear: the mean of forth and back."""
     if not path.is_file():
-        raise InputError(f"{path} does not exist; --data names the folder of the tables")
+        raise em.InputError(f"{path} does not exist; --data names the folder of the tables")
     table = np.genfromtxt(path, delimiter=",", names=True)
     forth, back = (
         np.stack(
@@ -77,22 +73,28 @@ def clots_in(folder: Path, calcium: Sequence[int] = CALCIUM) -> Clots:
     return {name: read(folder / f"{name}.csv") for name in names}
 
 
-def together(model: cal.Model, clots: Clots, quick: bool) -> cal.Hierarchy:
+def together(model: cal.Model, clots: Clots, quick: bool) -> cal.population.Hierarchy:
     """The population of clots, of which some have no normal stress."""
     draws = 50 if quick else 300
-    options = cal.NUTSOptions(warmup=draws, draws=draws, chains=2, rounds=1 if quick else 2)
+    options = cal.samplers.NUTSOptions(
+        warmup=draws, draws=draws, chains=2, rounds=1 if quick else 2
+    )
     members = {name: (model, values) for name, values in clots.items()}
-    return cal.hierarchy(members, options=options, alone="laplace", seed=SEED, progress=True)
+    return cal.population.hierarchy(
+        members, options=options, alone="laplace", seed=SEED, progress=True
+    )
 
 
 def band(model: cal.Model, draws: dict[str, np.ndarray]) -> np.ndarray:
     """90 % band (2, m, 2) of the stresses of clots with these parameters, errors included."""
-    some = {
-        name: jnp.asarray(values[:: max(len(values) // 500, 1)])[None]
-        for name, values in draws.items()
-    }
-    data = replicates(model, some, jax.random.key(SEED))["stress"][0]
-    return np.quantile(np.asarray(data), [0.05, 0.95], axis=0)
+    some = {n: jnp.asarray(values[:: max(len(values) // 500, 1)]) for n, values in draws.items()}
+
+    def one(draw: dict[str, jax.Array], key: jax.Array) -> jax.Array:
+        means, _ = model.predict(draw)
+        return model.distributions(draw, means)["stress"].sample(key)
+
+    keys = jax.random.split(jax.random.key(SEED), len(next(iter(some.values()))))
+    return np.quantile(np.asarray(jax.jit(jax.vmap(one))(some, keys)), [0.05, 0.95], axis=0)
 
 
 def inside(given: np.ndarray, clots: Clots) -> dict[str, dict[str, float]]:
@@ -171,7 +173,7 @@ def population(clots: Clots, quick: bool) -> Case:
 
 def plates(clots: Clots, quick: bool) -> Case:
     """What the plates do to the posterior of one clot, by FEM of the cube between them."""
-    model = model_of_clots(Grips((SIDE, SIDE, SIDE), cells=2 if quick else 4))
+    model = model_of_clots(em.specimens.Grips((SIDE, SIDE, SIDE), cells=2 if quick else 4))
     posterior = cal.sample(model, clots["C10_T90_y"], seed=SEED)
     certificate = cal.certify(posterior, em.homogeneous(model.full.scene), mesh=True, seed=SEED)
     mesh = certificate.to_json()["mesh"]
@@ -212,7 +214,7 @@ def main() -> None:
         print(json.dumps(judged(there, arguments.judge), indent=2))
         return
     if arguments.data is None:
-        raise InputError("give --data DIR, the folder of the tables")
+        raise em.InputError("give --data DIR, the folder of the tables")
     quick = arguments.quick
     clots = clots_in(arguments.data, CALCIUM[:1] if quick else CALCIUM)
     results = Results(arguments.out, SEED, again=arguments.again, settings={"quick": quick})

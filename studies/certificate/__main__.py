@@ -19,16 +19,14 @@ import numpy as np
 from studies.certificate import problems
 from studies.certificate.cases import cases
 from studies.certificate.problems import ExactSimulator
-from studies.common.output import save, study_header
+from studies.common.figures import BLUE, GREEN, ORANGE, VERMILION, pyplot
+from studies.common.output import save, study_header, write_json
 
 import calibrate as cal
-from calibrate.certificate import certify
-from calibrate.figures import BLUE, GREEN, ORANGE, VERMILION, pyplot
-from emulator import Simulator
-from emulator.core.store import write_json
+import emulator as em
 
 HERE = Path(__file__).parent
-NUTS = cal.NUTSOptions(500, 1000, chains=4)
+NUTS = cal.samplers.NUTSOptions(500, 1000, chains=4)
 SEED = 0
 LARGEST_SHIFT, LARGEST_SD = 0.5, 0.25  # what no accepted posterior may exceed
 # Colours and shapes that differ for every reader (Okabe and Ito 2008).
@@ -49,7 +47,7 @@ def row(case, problem, simulator, budget, *, nuts=False, at_most=None) -> dict[s
         posterior = cal.sample(posterior.model, data, options=NUTS, seed=case.seed)
     if posterior.model.full.scene is not problem.scene:  # in a box of its own
         simulator = ExactSimulator(posterior.model.full)
-    certificate = certify(
+    certificate = cal.certify(
         posterior, simulator, draws=budget or case.budget, at_most=at_most, seed=case.seed
     )
     draws = np.stack(list(posterior.draws().values()), axis=1)
@@ -148,7 +146,7 @@ def main() -> None:
         if case.problem not in built:
             problem = getattr(problems, case.problem)()
             exact = ExactSimulator(problem.forward)
-            built[case.problem] = problem, Simulator(problem.scene) if arguments.fem else exact
+            built[case.problem] = problem, em.Simulator(problem.scene) if arguments.fem else exact
         problem, simulator = built[case.problem]
         options = {"nuts": arguments.nuts, "at_most": arguments.until}
         rows.append(row(case, problem, simulator, arguments.draws, **options))

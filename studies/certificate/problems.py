@@ -15,12 +15,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from studies.common.twins import spread_nodes
 
+import calibrate as cal
 import emulator as em
-from calibrate.measurements import spread_nodes
-from emulator.fem.solution import Solution, Status
-from emulator.scenes.scene import all_nodes
-from emulator.surrogates.protocol import Prediction, fingerprint_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,13 +32,13 @@ class Map:
 
     @property
     def fingerprint(self):
-        return fingerprint_of(self.scene.fingerprint, str(id(self.function)), self.nodes)
+        return f"{self.scene.fingerprint} {id(self.function)} {hash(self.nodes.tobytes())}"
 
     def __call__(self, theta):
         return self.function(theta, self.nodes)
 
     def evaluate(self, theta):
-        return Prediction(self(theta), jnp.array(True))
+        return em.Prediction(self(theta), jnp.array(True))
 
     def at(self, nodes):
         return replace(self, nodes=nodes)
@@ -61,7 +59,7 @@ class ExactSimulator:
 
     def solve(self, theta, start=None):  # noqa: ARG002 - as FEM takes it
         u = self._solve(theta)
-        return Solution(u, jnp.array(Status.CONVERGED), *[jnp.array(0.0)] * 4)
+        return em.fem.Solution(u, jnp.array(em.fem.Status.CONVERGED), *[jnp.array(0.0)] * 4)
 
     def sensitivities(self, u, theta):  # noqa: ARG002 - as FEM takes it
         return jnp.moveaxis(self._slopes(theta), -1, 0)
@@ -148,8 +146,6 @@ def posterior_of(model, data, draws, chains=4, diverging=0):
     """A Posterior from draws (s, p) of theta."""
     import arviz_base
 
-    from calibrate.posterior import Posterior
-
     shape = (chains, len(draws) // chains)
     flags = np.zeros(shape, dtype=bool)
     flags.flat[:diverging] = True
@@ -160,14 +156,14 @@ def posterior_of(model, data, draws, chains=4, diverging=0):
             "sample_stats": {"diverging": flags},
         }
     )
-    return Posterior(tree, model, model.check_data(data))
+    return cal.Posterior(tree, model, model.check_data(data))
 
 
 # ---- problems ----------------------------------------------------------------------------------
 def beam():
     emulator = em.load("once_clamped_beam", kind="series").cache()
     observe = spread_nodes(emulator.scene, 20, 0)
-    forward = Map(emulator.scene, Restricted(emulator), all_nodes(emulator.scene))
+    forward = Map(emulator.scene, Restricted(emulator), np.arange(emulator.scene.node_count))
     truth = np.array([73.0, 61.0])
     return Problem("beam", forward, observe, 0.2, truth, (60.0, 50.0), (86.0, 100.0), (1500, 120))
 
@@ -189,7 +185,7 @@ def linear(scene, matrix, shift, feature=lambda theta: theta):
     def function(theta, nodes):
         return jnp.tensordot(matrix[nodes], feature(theta), axes=1) + shift[nodes]
 
-    return Map(scene, function, all_nodes(scene))
+    return Map(scene, function, np.arange(scene.node_count))
 
 
 def five():

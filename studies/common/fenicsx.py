@@ -18,12 +18,7 @@ import numpy as np
 from studies.common.output import Case
 from studies.common.timing import Clock, clocked
 
-from emulator.core.errors import InputError
-from emulator.fem import Simulator, uniform
-from emulator.fem.newton import NewtonOptions
-from emulator.geometry.discretisation import quadrature_points
-from emulator.scenes import Scene
-from emulator.scenes.loads import CavityPressure, Gravity
+import emulator as em
 
 AWAY = 0.03  # relative distance of a neighbour in every entry of theta
 SPARE = 3  # theta for the choice of settings; the first is not timed
@@ -32,7 +27,7 @@ PROGRAM = Path(__file__).with_name("fenicsx_solver.py")
 Arrays = dict[str, Any]
 
 
-def arrays(scene: Scene) -> Arrays:
+def arrays(scene: em.Scene) -> Arrays:
     """The scene as plain arrays: what FEniCSx is told."""
     found: Arrays = {
         "nodes": scene.mesh.nodes,
@@ -48,18 +43,18 @@ def arrays(scene: Scene) -> Arrays:
     if scene.fibres is not None:
         linear = scene.mesh.order == 1
         found["fibres"] = scene.fibres if linear else scene.fibres_at_points
-        found["points"] = quadrature_points(scene.mesh.order)[:, 1:]
+        found["points"] = em.geometry.quadrature_points(scene.mesh.order)[:, 1:]
     for load in scene.loads:
         found |= _load(scene, load)
     return found
 
 
-def _load(scene: Scene, load: object) -> Arrays:
-    if isinstance(load, Gravity):
+def _load(scene: em.Scene, load: object) -> Arrays:
+    if isinstance(load, em.loads.Gravity):
         return {"body_force": load.body_force}
-    if isinstance(load, CavityPressure) and "pressure" in scene.parameter_names:
+    if isinstance(load, em.loads.CavityPressure) and "pressure" in scene.parameter_names:
         return {"pressed": scene.mesh.facet_set(load.facet_set)}
-    raise InputError(f"scene '{scene.name}': FEniCSx is not told of {type(load).__name__}")
+    raise em.InputError(f"scene '{scene.name}': FEniCSx is not told of {type(load).__name__}")
 
 
 def solve(python: str, problem: Arrays) -> Arrays:
@@ -92,21 +87,25 @@ def neighbours(thetas: jax.Array) -> jax.Array:
 
 
 def compare(
-    scene: Scene, observed: np.ndarray, thetas: jax.Array, python: str, clock: Clock = process_time
+    scene: em.Scene,
+    observed: np.ndarray,
+    thetas: jax.Array,
+    python: str,
+    clock: Clock = process_time,
 ) -> tuple[Case, ...]:
     """Ours from rest and warm, then FEniCSx's: times, displacements (c, n, 3), differences.
 
     Gradients are of ``sum |u|^2`` over the ``observed`` nodes. FEniCSx has a clock of its own,
     processor seconds.
     """
-    simulator = Simulator(scene)
+    simulator = em.Simulator(scene)
     starts = [simulator.solve(theta).displacement for theta in neighbours(thetas)]
     cold = _ours(simulator, observed, thetas, [None] * len(thetas), clock)
     warm = _ours(simulator, observed, thetas, starts, clock)
-    spare = uniform(scene, SPARE, jax.random.key(8))
+    spare = em.fem.uniform(scene, SPARE, jax.random.key(8))
     told = {
         **arrays(scene), "observed": observed, "theta": thetas, "starts": np.stack(starts),
-        "spare": spare, "tolerance": NewtonOptions().tolerance,
+        "spare": spare, "tolerance": em.fem.NewtonOptions().tolerance,
     }  # fmt: skip
     found = solve(python, told)
     # Theta that FEniCSx gave up on, in any number of load steps, count for nobody's time.
@@ -134,7 +133,7 @@ def compare(
 
 
 def _ours(
-    simulator: Simulator,
+    simulator: em.Simulator,
     observed: np.ndarray,
     thetas: jax.Array,
     starts: list[Any],

@@ -3,13 +3,12 @@
 from typing import NamedTuple
 
 import emulator as em
-from emulator.surrogates.protocol import ForwardMap
 
 
 class Made(NamedTuple):
     """A forward map, the seconds of its making, and the FEM runs it took."""
 
-    forward: ForwardMap
+    forward: em.ForwardMap
     seconds: float
     fem_runs: int
 

@@ -5,16 +5,26 @@
 
 import argparse
 import json
+import math
+import os
+import platform
 import subprocess
 import sys
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from calibrate.figures import pyplot
-from calibrate.provenance import hardware, versions
-from emulator.core.errors import InputError, SolverError
-from emulator.core.store import replacing, write_json
+import jax
+import numpy as np
+from studies.common.figures import pyplot
+
+import emulator as em
+
+PACKAGES = ("soft-tissue-calibrate", "jax", "jaxlib", "flax", "optax", "numpyro", "numpy", "scipy",
+            "scikit-fem", "scikit-learn", "sparsax", "arviz")  # fmt: skip
 
 Case = dict[str, Any]
 
@@ -34,7 +44,7 @@ def run(main: Callable[[], None]) -> None:
     """A study that reads what a user gives: what is wrong with it is told in one line."""
     try:
         main()
-    except (InputError, SolverError, OSError) as error:
+    except (em.InputError, em.SolverError, OSError) as error:
         raise SystemExit(f"{Path(sys.argv[0]).parent.name}: {error}") from None
 
 
@@ -46,6 +56,73 @@ def commit(folder: str | Path) -> str | None:
     except (OSError, subprocess.CalledProcessError):
         return None
     return process.stdout.strip()
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of the packages that the numbers depend on."""
+    return {name: version(name) for name in PACKAGES}
+
+
+def hardware() -> dict[str, Any]:
+    """Return processor, cores, and the accelerator if JAX uses one."""
+    accelerator = None if jax.default_backend() == "cpu" else jax.devices()[0].device_kind
+    cpuinfo, processor = Path("/proc/cpuinfo"), ""
+    if cpuinfo.is_file():
+        lines = cpuinfo.read_text(encoding="utf-8").splitlines()
+        named = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+        processor = next(named, "")
+    return {
+        "processor": processor or platform.processor() or "unknown",
+        "cores": os.cpu_count(),
+        "machine": platform.machine(),
+        "accelerator": accelerator,
+    }
+
+
+def cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a temporary file next to ``path``, which it replaces if nothing raises."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        temporary.chmod(0o644)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _finite(content: Any) -> Any:
+    if isinstance(content, Mapping):
+        return {key: _finite(value) for key, value in content.items()}
+    if isinstance(content, np.ndarray):
+        content = content.tolist()
+    if isinstance(content, list | tuple):
+        return [_finite(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write ``content``, whole or not at all; numbers that are not finite become null."""
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
+
+
+def table(header: list[str], rows: list[list[str]]) -> str:
+    """Return lines of columns as wide as their widest cell, the first one to the left."""
+    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+    return "\n".join(
+        "  ".join(cell.ljust(w) if k == 0 else cell.rjust(w)
+                  for k, (cell, w) in enumerate(zip(row, widths, strict=True))).rstrip()
+        for row in (header, *rows)
+    )  # fmt: skip
 
 
 def study_header(folder: str | Path, seed: int) -> dict[str, Any]:

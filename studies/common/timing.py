@@ -6,19 +6,17 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from emulator.fem import uniform
-from emulator.scenes import Scene
+import emulator as em
 
 Function = Callable[[jax.Array], Any]
 Clock = Callable[[], float]
 
 
-def unseen(scene: Scene, count: int, *, keys: Iterator[int] = itertools.count()) -> jax.Array:
+def unseen(scene: em.Scene, count: int, *, keys: Iterator[int] = itertools.count()) -> jax.Array:
     """Theta (count, p) that no call has had before."""
-    return uniform(scene, count, jax.random.key(2000 + next(keys)))
+    return em.fem.uniform(scene, count, jax.random.key(2000 + next(keys)))
 
 
 def per_call(function: Function, arguments: jax.Array, clock: Clock = time.perf_counter) -> float:
@@ -36,28 +34,6 @@ def per_call(function: Function, arguments: jax.Array, clock: Clock = time.perf_
     return float(np.median(durations))
 
 
-def loop(function: Function) -> Function:
-    """One program that sums ``function`` over many theta, so that nothing can be left out."""
-
-    def step(total: jax.Array, theta: jax.Array) -> tuple[jax.Array, None]:
-        leaves = jax.tree.leaves(function(theta))
-        return total + sum(jnp.sum(leaf) for leaf in leaves), None
-
-    return jax.jit(lambda thetas: jax.lax.scan(step, jnp.zeros(()), thetas)[0])
-
-
-def in_loop(function: Function, scene: Scene, count: int, repeats: int = 5) -> float:
-    """Median over ``repeats`` of the seconds per theta in a compiled loop over ``count`` theta."""
-    batches = unseen(scene, count * (repeats + 1)).reshape(repeats + 1, count, -1)
-    return per_call(loop(function), batches) / count
-
-
-def batched(function: Function, scene: Scene, size: int, repeats: int = 5) -> float:
-    """Median over ``repeats`` of the seconds per theta in one call of ``size`` under ``vmap``."""
-    batches = unseen(scene, size * (repeats + 1)).reshape(repeats + 1, size, -1)
-    return per_call(jax.jit(jax.vmap(function)), batches) / size
-
-
 def clocked(
     function: Callable[..., Any], *arguments: Any, clock: Clock = time.perf_counter
 ) -> tuple[float, Any]:
@@ -65,7 +41,3 @@ def clocked(
     begin = clock()
     result = jax.block_until_ready(function(*arguments))
     return clock() - begin, result
-
-
-def milliseconds(seconds: float | None) -> str:
-    return "" if seconds is None else f"{1e3 * seconds:.4f} ms"

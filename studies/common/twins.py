@@ -9,23 +9,27 @@ import jax
 import numpy as np
 
 import calibrate as cal
-from calibrate.measurements import parse_observation
-from calibrate.measurements.collection import Observations
-from emulator.scenes.scene import Scene
+import emulator as em
 
 
 def twin(
-    scene: Scene, words: str, sd: Mapping[str, float], theta: jax.Array, u: jax.Array, seed: int
-) -> tuple[Observations, dict[str, cal.GaussianNoise], dict[str, np.ndarray]]:
+    scene: em.Scene, words: str, sd: Mapping[str, float], theta: jax.Array, u: jax.Array, seed: int
+) -> tuple[cal.Observations, dict[str, cal.GaussianNoise], dict[str, np.ndarray]]:
     """Return what is observed, its noise, and data.
 
     words : what is observed, as of ``--observe``. sd : the noise by the observation's name.
     theta, u : the parameters (p,), and FEM's displacement (n, 3) mm there.
     """
-    observe = parse_observation(scene, words)
+    observe = cal.parse_observation(scene, words)
     exact = observe(u[None, observe.nodes], theta[None])
     rng = np.random.default_rng(seed)
     data: dict[str, Any] = {
         name: np.asarray(v) + sd[name] * rng.normal(size=v.shape) for name, v in exact.items()
     }
     return observe, {name: cal.GaussianNoise(sd[name]) for name in exact}, data
+
+
+def spread_nodes(scene: em.Scene, count: int, seed: int) -> np.ndarray:
+    """Return ``count`` nodes with a free component, drawn without replacement, sorted."""
+    free = np.flatnonzero(~scene.held.all(axis=1))
+    return np.sort(np.random.default_rng(seed).choice(free, count, replace=False))

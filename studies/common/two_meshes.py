@@ -5,8 +5,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import emulator as em
-from emulator.scenes import Scene
-from emulator.scenes.finer import finer
 
 _ON_MESH = replace(em.recipe("mechanics"), simulations=200)
 
@@ -18,13 +16,13 @@ class Pair(NamedTuple):
     fine: em.Emulator
 
 
-def on_mesh(scene: Scene, folder: Path) -> em.Emulator:
+def on_mesh(scene: em.Scene, folder: Path) -> em.Emulator:
     """Trained on ``scene``, from 200 runs and a series."""
     return em.train(scene, _ON_MESH, folder)
 
 
-def on_two_meshes(scene: Scene, folder: Path) -> Pair:
+def on_two_meshes(scene: em.Scene, folder: Path) -> Pair:
     """Trained on ``scene``, then taken to its finer mesh by a few runs there."""
     coarse = on_mesh(scene, folder)
     plan = em.recipe("two_meshes")
-    return Pair(coarse, em.train(finer(scene).scene, plan, folder / "finer", start=coarse))
+    return Pair(coarse, em.train(em.finer(scene).scene, plan, folder / "finer", start=coarse))

@@ -21,13 +21,12 @@ from studies.fem_speed.figures import draw, tables
 from studies.fem_speed.problems import plate, ventricle
 
 import emulator as em
-from emulator.scenes.scene import Scene
 
 HERE = Path(__file__).parent
 CUBES = (6, 9, 13, 19, 27)
 LIMIT = 900.0  # seconds for one cube
 FINE = "ventricle, finer"
-BODIES: dict[str, Callable[[], Scene]] = {
+BODIES: dict[str, Callable[[], em.Scene]] = {
     "beam, linear": lambda: em.scenes.once_clamped_beam(order=1),
     "beam": em.scenes.once_clamped_beam,
     "ventricle, linear": lambda: em.scenes.left_ventricle(order=1),

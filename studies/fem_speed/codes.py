@@ -13,9 +13,6 @@ from studies.fem_speed.plain_skfem import Body
 from studies.fem_speed.problems import Problem, arrays, with_free_pressure
 
 import emulator as em
-from emulator.fem import Status, uniform
-from emulator.geometry.facets import enclosed_volume
-from emulator.scenes.scene import Scene
 
 SEED = 7
 AWAY = 0.03  # relative distance of the theta of a warm start from the one to solve
@@ -84,13 +81,13 @@ def ours_warm(simulator: em.Simulator, thetas: jax.Array) -> Case:
     )
 
 
-def wall_volume(scene: Scene, facet_set: str) -> Callable[[jax.Array], jax.Array]:
+def wall_volume(scene: em.Scene, facet_set: str) -> Callable[[jax.Array], jax.Array]:
     """Displacement (n, 3) mm to the volume in mL between a facet set and lids on its openings.
 
     Unlike a cavity's it may be zero at rest: the slab's pressed face is flat.
     """
     facets = scene.mesh.facet_set(facet_set)
-    volume: Callable[[jax.Array], jax.Array] = enclosed_volume(facets)
+    volume: Callable[[jax.Array], jax.Array] = em.geometry.enclosed_volume(facets)
     return lambda u: volume(scene.mesh.nodes + u) / 1000.0
 
 
@@ -113,7 +110,7 @@ def ours_gradient(simulator: em.Simulator, facet_set: str, thetas: jax.Array) ->
     return row(
         "ours, warm, volume and gradient",
         seconds,
-        [int(run[1][0][1]) == Status.CONVERGED for run in runs],
+        [int(run[1][0][1]) == em.fem.Status.CONVERGED for run in runs],
         first_call_s=first,
         compile_s=compile_s,
         gradient_error=_slope_error(simulator, value, thetas[1], runs[0][1][1]),
@@ -140,7 +137,7 @@ def relative_difference(u: np.ndarray, reference: np.ndarray) -> float:
 def plain(problem: Problem, thetas: jax.Array, reference: np.ndarray) -> Case:
     """scikit-fem and SciPy, in the number of load steps that needs the fewest iterations."""
     body = Body(**arrays(problem))
-    spare = np.asarray(uniform(problem.scene, 3, jax.random.key(SEED + 2)))
+    spare = np.asarray(em.fem.uniform(problem.scene, 3, jax.random.key(SEED + 2)))
     steps = min(
         (1, 2, 3, 4, 6), key=lambda k: sum(body.solve(theta, k).iterations for theta in spare)
     )
@@ -160,7 +157,7 @@ def compare(problem: Problem, count: int) -> list[Case]:
     scene, free_scene = problem.scene, with_free_pressure(problem)
     # New theta for each way of calling: factors of solved ones may be kept.
     cold, warm, slope = (
-        uniform(body, count + 1, jax.random.key(SEED + number))
+        em.fem.uniform(body, count + 1, jax.random.key(SEED + number))
         for number, body in enumerate((scene, free_scene, free_scene), start=10)
     )
     case, reference = ours_cold(em.Simulator(scene), cold)

@@ -14,7 +14,6 @@ from studies.common.processes import peak_gb
 from studies.common.timing import clocked
 
 import emulator as em
-from emulator.fem import Status
 
 
 def main() -> None:
@@ -28,7 +27,7 @@ def main() -> None:
     seconds, solution = clocked(simulator.solve, scene.centre * jnp.array([1.3, 0.9]))
     row = {
         "name": f"cube, {cells} cells an edge",
-        "status": Status(int(solution.status)).text,
+        "status": em.fem.Status(int(solution.status)).text,
         "nodes": len(scene.mesh.nodes),
         "elements": len(scene.mesh.elements),
         "iterations": int(solution.iterations),

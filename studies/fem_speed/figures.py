@@ -2,9 +2,8 @@
 
 from pathlib import Path
 
+from studies.common.figures import pyplot
 from studies.common.output import Case, save
-
-from calibrate.figures import pyplot
 
 
 def draw(cases: list[Case], path: Path) -> None:

@@ -11,34 +11,29 @@ from studies.common.output import Case
 from studies.common.timing import clocked
 
 import emulator as em
-from emulator.geometry.generators.box import box
-from emulator.mechanics.laws import find_law
-from emulator.scenes.loads import DeadPressure
-from emulator.scenes.parameter_space import Parameter
-from emulator.scenes.scene import Scene
 
 CELLS = (34, 24, 6)  # 6125 nodes
 INCREMENTS = 10
 PRESSURE = 8.0  # kPa at the end
 
 
-def block(cells: tuple[int, int, int]) -> Scene:
+def block(cells: tuple[int, int, int]) -> em.Scene:
     """A block clamped at one end and pressed from below: it bends up by half its length."""
-    return Scene(
+    return em.Scene(
         name="pressed_block",
-        mesh=box((34.0, 24.0, 6.0), cells),
-        law=find_law("neo_hookean"),
+        mesh=em.generators.box((34.0, 24.0, 6.0), cells),
+        law=em.find_law("neo_hookean"),
         parameters=(
-            Parameter("mu", "kPa", 100.0, 400.0, "log"),
-            Parameter("lam", "kPa", 100.0, 800.0, "log"),
-            Parameter("pressure", "kPa", 0.0, PRESSURE),
+            em.Parameter("mu", "kPa", 100.0, 400.0, "log"),
+            em.Parameter("lam", "kPa", 100.0, 800.0, "log"),
+            em.Parameter("pressure", "kPa", 0.0, PRESSURE),
         ),
-        loads=(DeadPressure("bottom"),),
+        loads=(em.loads.DeadPressure("bottom"),),
         supports=(em.Support("left"),),
     )
 
 
-def climb(simulator: em.Simulator, constants: jax.Array) -> tuple[jax.Array, list[em.Solution]]:
+def climb(simulator: em.Simulator, constants: jax.Array) -> tuple[jax.Array, list[em.fem.Solution]]:
     """Sum of the end's displacements over the increments in mm, and the solutions."""
     end = simulator.scene.mesh.node_set("right")
     total, found, start = jnp.zeros(()), [], None

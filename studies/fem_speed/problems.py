@@ -7,45 +7,39 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import emulator as em
-from emulator.geometry.generators.box import box
-from emulator.mechanics.laws import find_law
-from emulator.released.scenes import published_scene
-from emulator.scenes.loads import KPA_PER_MMHG, CavityPressure
-from emulator.scenes.parameter_space import Parameter
-from emulator.scenes.scene import Scene
 
-PRESSURE = 8.0 * KPA_PER_MMHG
+PRESSURE = 8.0 * em.loads.KPA_PER_MMHG
 
 
 class Problem(NamedTuple):
     """A pressurised body: its scene at the fixed pressure, and the facets the pressure acts on."""
 
     name: str
-    scene: Scene
+    scene: em.Scene
     facet_set: str
 
 
 def ventricle(root: Path) -> Problem:
     """The released left ventricle, with the exact cavity pressure in place of the released one."""
-    scene = published_scene("LeftVentricle", root)
-    load = CavityPressure("endocardium", PRESSURE)
+    scene = em.released.published_scene("LeftVentricle", root)
+    load = em.loads.CavityPressure("endocardium", PRESSURE)
     return Problem("LeftVentricle", dataclasses.replace(scene, loads=(load,)), "endocardium")
 
 
 def plate() -> Problem:
     """A small plate held at its sides, pressed from below: the same law, no released data."""
-    mesh = box((10.0, 10.0, 2.0), (4, 4, 2))
-    scene = Scene(
+    mesh = em.generators.box((10.0, 10.0, 2.0), (4, 4, 2))
+    scene = em.Scene(
         name="pressed_plate",
         mesh=mesh,
-        law=find_law("holzapfel_ogden_released"),
+        law=em.find_law("holzapfel_ogden_released"),
         parameters=(
-            Parameter("a", "kPa", 0.1, 0.26, "log"),
-            Parameter("b", "", 1.0, 4.2, "log"),
-            Parameter("a_f", "kPa", 1.5, 5.18, "log"),
-            Parameter("b_f", "", 1.0, 4.46, "log"),
+            em.Parameter("a", "kPa", 0.1, 0.26, "log"),
+            em.Parameter("b", "", 1.0, 4.2, "log"),
+            em.Parameter("a_f", "kPa", 1.5, 5.18, "log"),
+            em.Parameter("b_f", "", 1.0, 4.46, "log"),
         ),
-        loads=(CavityPressure("bottom", PRESSURE),),
+        loads=(em.loads.CavityPressure("bottom", PRESSURE),),
         supports=tuple(em.Support(side) for side in ("left", "right", "front", "back")),
         constants={"kappa": 25.0},
         fibres=np.tile([1.0, 0.0, 0.0], (len(mesh.elements), 1)),
@@ -53,12 +47,14 @@ def plate() -> Problem:
     return Problem("plate", scene, "bottom")
 
 
-def with_free_pressure(problem: Problem) -> Scene:
+def with_free_pressure(problem: Problem) -> em.Scene:
     """The scene with the pressure as its last parameter, 4 to 10 mmHg."""
-    pressure = Parameter("pressure", "kPa", 4.0 * KPA_PER_MMHG, 10.0 * KPA_PER_MMHG)
+    pressure = em.Parameter(
+        "pressure", "kPa", 4.0 * em.loads.KPA_PER_MMHG, 10.0 * em.loads.KPA_PER_MMHG
+    )
     return dataclasses.replace(
         problem.scene,
-        loads=(CavityPressure(problem.facet_set),),
+        loads=(em.loads.CavityPressure(problem.facet_set),),
         parameters=(*problem.scene.parameters, pressure),
     )
 

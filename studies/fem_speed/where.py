@@ -15,10 +15,8 @@ from studies.common.fenicsx import compare
 from studies.common.output import Case
 from studies.common.timing import clocked
 
+import calibrate as cal
 import emulator as em
-from calibrate.measurements import landmarks, spread_landmarks
-from emulator.fem import sobol
-from emulator.scenes.scene import Scene
 
 SEED = 3
 POINTS = 24
@@ -30,10 +28,10 @@ class Solved(NamedTuple):
     seconds: float
     iterations: int
     factorisations: int
-    solutions: list[em.Solution]
+    solutions: list[em.fem.Solution]
 
 
-def solved(solve: Callable[[jax.Array], em.Solution], thetas: jax.Array) -> Solved:
+def solved(solve: Callable[[jax.Array], em.fem.Solution], thetas: jax.Array) -> Solved:
     """``solve`` timed at each of ``thetas`` but the first, which compiles."""
     runs = [clocked(solve, theta) for theta in thetas]
     assert all(solution.converged for _, solution in runs)
@@ -71,9 +69,9 @@ def parts(simulator: em.Simulator, theta: jax.Array, u: jax.Array, count: int) -
     }
 
 
-def of_body(scene: Scene, count: int) -> Case:
+def of_body(scene: em.Scene, count: int) -> Case:
     """A scene from rest at ``count`` theta, from Python and inside ``jit``, and its parts."""
-    simulator, thetas = em.Simulator(scene), sobol(scene, count + 1, SEED)
+    simulator, thetas = em.Simulator(scene), em.fem.sobol(scene, count + 1, SEED)
     python = solved(simulator.solve, thetas)
     inside = solved(jax.jit(em.Simulator(scene).solve), thetas)  # no factor of the other's
     each = parts(simulator, thetas[-1], python.solutions[-1].displacement, count)
@@ -94,13 +92,13 @@ def of_body(scene: Scene, count: int) -> Case:
     }
 
 
-def parity(scene: Scene, count: int) -> Case:
+def parity(scene: em.Scene, count: int) -> Case:
     """Python and ``jit`` at ``count`` theta, the softest corner among them: the same iterates?"""
     # Simulators of their own, so that neither takes the other's factors.
     python, inside = em.Simulator(scene).solve, jax.jit(em.Simulator(scene).solve)
     corner = np.array([float(p.name == "pressure") for p in scene.parameters])
     softest = jnp.asarray(scene.from_unit(jnp.asarray(corner)))
-    pairs = [(python(x), inside(x)) for x in (softest, *sobol(scene, count - 1, SEED))]
+    pairs = [(python(x), inside(x)) for x in (softest, *em.fem.sobol(scene, count - 1, SEED))]
     gaps = [
         float(jnp.abs(a.displacement - b.displacement).max() / jnp.abs(a.displacement).max())
         for a, b in pairs
@@ -113,13 +111,13 @@ def parity(scene: Scene, count: int) -> Case:
     }
 
 
-def beside_fenicsx(scene: Scene, count: int, python: str) -> Case:
+def beside_fenicsx(scene: em.Scene, count: int, python: str) -> Case:
     """Seconds of ours and of FEniCSx, one after the other, and how far they differ.
 
     FEniCSx has one thread and processor seconds; ours is timed by the wall, as a user waits.
     """
-    observed = landmarks(scene, spread_landmarks(scene, POINTS, SEED)).nodes
-    thetas = sobol(scene, count, SEED)
+    observed = cal.landmarks(scene, cal.spread_landmarks(scene, POINTS, SEED)).nodes
+    thetas = em.fem.sobol(scene, count, SEED)
     found = compare(scene, observed, thetas, python, clock=time.perf_counter)
     cold, warm, theirs, theirs_warm = found
     dropped = ("displacement", "value_s", "gradient_s", "tried")

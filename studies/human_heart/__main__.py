@@ -38,12 +38,6 @@ from studies.human_heart.twins import coverage, twin, unloaded_volumes
 
 import calibrate as cal
 import emulator as em
-from calibrate.measurements.collection import observations
-from calibrate.measurements.frames import frame_data
-from emulator.core.errors import InputError
-from emulator.scenes import Scene
-from emulator.scenes.loads import KPA_PER_MMHG
-from emulator.training import recipe, train
 
 HERE = Path(__file__).parent
 SEED = 18
@@ -62,7 +56,7 @@ AT_REST = (5.0, 2.0)  # in the frame that is meshed
 _MATERIAL = ("a", "a_f", "imaged", "imaged_right", "pericardium", "annulus")
 
 
-def prior_of(scene: Scene, frames: tuple[str, ...], told: Case | None = None) -> dict[str, Any]:
+def prior_of(scene: em.Scene, frames: tuple[str, ...], told: Case | None = None) -> dict[str, Any]:
     """Pressures as physiology has them; the rest by the scene's ranges, or as ``told`` has it.
 
     told : means and sds of parameters that other frames told.
@@ -70,7 +64,9 @@ def prior_of(scene: Scene, frames: tuple[str, ...], told: Case | None = None) ->
     ranges = {p.name: (p.low, p.high) for p in scene.parameters}
 
     def about(name: str, mean: float, sd: float) -> Any:
-        return cal.truncated_normal(mean * KPA_PER_MMHG, sd * KPA_PER_MMHG, *ranges[name])
+        return cal.priors.truncated_normal(
+            mean * em.loads.KPA_PER_MMHG, sd * em.loads.KPA_PER_MMHG, *ranges[name]
+        )
 
     priors = {"imaged": ("imaged", 1.0, AT_REST), "imaged_right": ("imaged_right", 0.225, AT_REST)}
     for frame in frames:
@@ -83,19 +79,19 @@ def prior_of(scene: Scene, frames: tuple[str, ...], told: Case | None = None) ->
     }
     for name, row in (told or {}).items():
         if name in ranges:
-            prior[name] = cal.truncated_normal(row["mean"], row["sd"], *ranges[name])
+            prior[name] = cal.priors.truncated_normal(row["mean"], row["sd"], *ranges[name])
     return prior
 
 
 def model_of(
-    scene: Scene, forward: Any, folder: Path, frames: tuple[str, ...], quick: bool,
+    scene: em.Scene, forward: Any, folder: Path, frames: tuple[str, ...], quick: bool,
     assumed: Assumed = AS_IMAGED, told: Case | None = None,
 ) -> tuple[cal.Model, Any]:  # fmt: skip
     """The model of these frames' surfaces, and their data.
 
     Volumes are of the same surfaces, and would count them twice.
     """
-    observe, data = frame_data(
+    observe, data = cal.fields.frame_data(
         scene,
         {
             f"{facets}@{frame}": surfaces_of(folder, frame)[surface]
@@ -104,7 +100,7 @@ def model_of(
         },
         12 if quick else POINTS,
     )
-    observe = observations(
+    observe = cal.Observations(
         {n: part for n, part in observe.parts.items() if n.startswith("surface")}
     )
     noise = {
@@ -118,13 +114,13 @@ def model_of(
 def posterior_of(model: cal.Model, data: Any, quick: bool) -> cal.Posterior:
     """The posterior of material, supports and pressures."""
     draws = 50 if quick else 250
-    options = cal.NUTSOptions(
+    options = cal.samplers.NUTSOptions(
         warmup=draws, draws=draws, chains=2, rounds=1 if quick else 2, target_accept=0.95
     )
     return cal.sample(model, data, sampler="nuts", options=options, seed=SEED, predictions=False)
 
 
-def told_by(found: cal.Posterior, scene: Scene, assumed: Assumed = AS_IMAGED) -> Case:
+def told_by(found: cal.Posterior, scene: em.Scene, assumed: Assumed = AS_IMAGED) -> Case:
     """Means, sds and 90 % intervals of all unknowns, and the quality of the draws."""
     volumes = {} if assumed.contracts else unloaded_volumes(found, scene, assumed.cavities)
     return {
@@ -137,7 +133,7 @@ def told_by(found: cal.Posterior, scene: Scene, assumed: Assumed = AS_IMAGED) ->
     }
 
 
-def on_surface(found: cal.Posterior, scene: Scene, frame: str) -> Case:
+def on_surface(found: cal.Posterior, scene: em.Scene, frame: str) -> Case:
     """Mean and sd of the surface's displacement from the imaged frame, at the nodes, mm."""
     thetas = found.thetas(frame)[:: -(-len(found.thetas(frame)) // MOMENTS)]
     nodes = np.unique(scene.mesh.surface[:, :3])
@@ -152,11 +148,15 @@ def on_surface(found: cal.Posterior, scene: Scene, frame: str) -> Case:
     }
 
 
-def emulated(scene: Scene, folder: Path, quick: bool, runs: int = RUNS) -> tuple[em.Emulator, Case]:
+def emulated(
+    scene: em.Scene, folder: Path, quick: bool, runs: int = RUNS
+) -> tuple[em.Emulator, Case]:
     """The emulator of unloading and loading, and its error; one that is in ``folder`` is kept."""
     if not (folder / "emulator.json").is_file():
-        plan = replace(recipe("mechanics"), simulations=12 if quick else runs, order=1, seed=SEED)
-        emulator = train(scene, plan, folder, progress=True)
+        plan = replace(
+            em.recipe("mechanics"), simulations=12 if quick else runs, order=1, seed=SEED
+        )
+        emulator = em.train(scene, plan, folder, progress=True)
         em.save_emulator(emulator, folder)
     emulator = em.load(folder, scene)
     return emulator, {
@@ -196,7 +196,7 @@ def main() -> None:
         print(json.dumps(judged(case["bands"], arguments.judge, KEPT_APART), indent=2))
         return
     if arguments.data is None:
-        raise InputError("give --data DIR, the folder of the surfaces")
+        raise em.InputError("give --data DIR, the folder of the surfaces")
     quick, data = arguments.quick, arguments.data
     keep = arguments.keep or arguments.out / "emulator"
     scene = scene_of(data, keep.parent)

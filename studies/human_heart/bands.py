@@ -11,26 +11,19 @@ at another volume, given all frames, and of the draws. A volume has the same mod
 """
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
+from studies.common.kernels import matern32
 from studies.common.output import Case
 from studies.human_heart.heart import IMAGED, LENGTH, SURFACES, surfaces_of
 
 import calibrate as cal
-from calibrate.measurements.collection import observations
-from calibrate.measurements.frames import along_normals, spread_evenly
-from calibrate.measurements.surface import SurfacePoints
-from calibrate.measurements.volume import CavityVolume
-from emulator.core.errors import InputError
-from emulator.core.gaussian_process import CORRELATIONS
-from emulator.core.units import MM3_PER_ML
-from emulator.scenes import Scene
-from emulator.surrogates.protocol import ForwardMap
+import emulator as em
 
 KEPT_APART = ("f017", "f019", "f021", "f023")
 VOLUMES = np.arange(140.0, 186.0, 3.0)  # mL, of the left cavity
@@ -51,17 +44,19 @@ class Seen(NamedTuple):
 def seen_at(places: dict[str, tuple[np.ndarray, np.ndarray]], folder: Path, frame: str) -> Seen:
     """A frame along the normals of points; places (d, 3) and normals (d, 3) by surface."""
     surfaces = surfaces_of(folder, frame)
-    left, right = (surfaces[name].volume / MM3_PER_ML for name in SURFACES[:2])
+    left, right = (surfaces[name].volume / 1000.0 for name in SURFACES[:2])
     ways = {
-        name: along_normals(points, normals, surfaces[name], 0.2 * np.ptp(points, axis=0).max())
+        name: cal.fields.along_normals(
+            points, normals, surfaces[name], 0.2 * np.ptp(points, axis=0).max()
+        )
         for name, (points, normals) in places.items()
     }
     return Seen(left, right, ways)
 
 
 def bands_of(
-    found: cal.Posterior, scene: Scene, forward: ForwardMap, folder: Path, frames: tuple[str, ...],
-    quick: bool,
+    found: cal.Posterior, scene: em.Scene, forward: em.ForwardMap, folder: Path,
+    frames: tuple[str, ...], quick: bool,
 ) -> Case:  # fmt: skip
     """5, 50 and 95 % of normal distances and of the right volume, at each left volume.
 
@@ -69,7 +64,7 @@ def bands_of(
     """
     count = 20 if quick else POINTS
     parts = {
-        name: SurfacePoints.of(scene, name, spread_evenly(scene.mesh, name, count))
+        name: cal.surface_points(scene, name, cal.fields.spread_evenly(scene.mesh, name, count))
         for name in SURFACES
     }
     places = {name: (part.points, part.normals) for name, part in parts.items()}
@@ -89,7 +84,7 @@ def bands_of(
     for name, (points, _) in places.items():
         key = f"surface:{name}"
         missed = np.array([frame.ways[name] for frame in known]) - means[key][own]
-        K = CORRELATIONS["matern32"](cdist(points, points, "sqeuclidean") / LENGTH**2)
+        K = np.asarray(matern32(cdist(points, points, "sqeuclidean") / LENGTH**2))
         mean, sd, told = _field(_filled(missed, points), K, h[own], h[grid])
         bands["sds"][name] = told
         bands[key] = _levels(means[key][grid] + mean, np.hypot(sd, sds[key][grid]), _NORMAL)
@@ -107,16 +102,16 @@ def _levels(middle: np.ndarray, sd: np.ndarray, factor: float) -> list:
 
 
 def _by_mechanics(
-    found: cal.Posterior, scene: Scene, forward: ForwardMap, parts: dict[str, SurfacePoints],
+    found: cal.Posterior, scene: em.Scene, forward: em.ForwardMap, parts: dict[str, Any],
     volumes: np.ndarray,
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], np.ndarray]:  # fmt: skip
     """Means and sds over draws of all that is predicted, and the share of draws that come so far.
 
     Arrays (v, ...) by observation, at each left volume (v,).
     """
-    observe = observations({
+    observe = cal.Observations({
         **{f"surface:{name}": part for name, part in parts.items()},
-        **{f"volume:{name}": CavityVolume(scene, name) for name in SURFACES[:2]},
+        **{f"volume:{name}": cal.CavityVolume(scene, name) for name in SURFACES[:2]},
     })  # fmt: skip
     at = forward.at(observe.nodes)
     program = jax.jit(jax.vmap(lambda theta: observe(at(theta)[None], theta[None])))
@@ -206,7 +201,7 @@ def judged(bands: Case, data: Path, frames: tuple[str, ...]) -> Case:
     for frame in frames:
         left, right, ways = seen_at(places, data, frame)
         if not grid[0] <= left <= grid[-1]:
-            raise InputError(
+            raise em.InputError(
                 f"frame {frame}: {left:.1f} mL; bands are of {grid[0]:g} to {grid[-1]:g} mL"
             )
         above = np.clip(np.searchsorted(grid, left), 1, len(grid) - 1)

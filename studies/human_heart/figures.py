@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+from studies.common.figures import BLUE, ORANGE, pyplot
 from studies.common.output import Case, save
 from studies.human_heart.heart import SURFACES
 
-from calibrate.figures import BLUE, ORANGE, pyplot
-from emulator.scenes import Scene
+import emulator as em
 
 
 def draw(cases: dict[str, Case], path: Path) -> None:
@@ -52,7 +52,7 @@ def draw(cases: dict[str, Case], path: Path) -> None:
     save(figure, path)
 
 
-def draw_surface(case: Case, scene: Scene, axis: np.ndarray, path: Path) -> None:
+def draw_surface(case: Case, scene: em.Scene, axis: np.ndarray, path: Path) -> None:
     """The fullest frame's shape, by the mean and the sd of how far its nodes have moved.
 
     axis : the long axis (3,), from apex to base.

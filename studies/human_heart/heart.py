@@ -4,10 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import emulator as em
-from emulator.core.errors import InputError
-from emulator.geometry.io import write_mesh
-from emulator.hearts.surfaces import Surface, read_surface
-from emulator.scenes import Scene
 
 SURFACES = ("lv_endocardium", "rv_endocardium", "epicardium")
 _FILES = ("LV_ENDOCARDIAL", "RV_ENDOCARDIAL", "EPICARDIAL")
@@ -108,27 +104,29 @@ def _scene_file(assumed: Assumed, axis: list[float]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def surfaces_of(folder: Path, frame: str) -> dict[str, Surface]:
+def surfaces_of(folder: Path, frame: str) -> dict[str, em.hearts.Surface]:
     """The three surfaces of a frame, by facet set."""
     found = {}
     for name, file in zip(SURFACES, _FILES, strict=True):
         path = folder / f"{file}_{frame[1:]}.obj"
         if not path.is_file():
-            raise InputError(f"{path} does not exist; name the folder of the surfaces")
-        found[name] = read_surface(path, name)
+            raise em.InputError(f"{path} does not exist; name the folder of the surfaces")
+        found[name] = em.hearts.read_surface(path, name)
     return found
 
 
-def scene_of(data: Path, folder: Path, assumed: Assumed = AS_IMAGED) -> Scene:
+def scene_of(data: Path, folder: Path, assumed: Assumed = AS_IMAGED) -> em.Scene:
     """The scene of the imaged frame, written to ``folder``; a mesh that is there is kept."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "heart.toml"
     if not path.is_file():
         left, right, outside = surfaces_of(data, IMAGED).values()
         if assumed.both:
-            wall = em.mesh_wall(left, outside, right=right, size=_SIZE)
+            wall = em.hearts.mesh_wall(left, outside, right=right, size=_SIZE)
         else:
-            wall = em.mesh_wall(left, outside, right=right, ventricles="left", size=_LEFT_SIZE)
-        write_mesh(folder / "heart.vtu", wall.mesh)
+            wall = em.hearts.mesh_wall(
+                left, outside, right=right, ventricles="left", size=_LEFT_SIZE
+            )
+        em.write_mesh(folder / "heart.vtu", wall.mesh)
         path.write_text(_scene_file(assumed, [float(x) for x in wall.axis]))
     return em.find_scene(str(path))

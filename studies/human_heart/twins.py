@@ -10,22 +10,19 @@ from studies.human_heart.heart import SURFACES
 
 import calibrate as cal
 import emulator as em
-from calibrate.measurements.volume import CavityVolume
-from emulator.core.errors import SolverError
-from emulator.scenes import Scene
 
 _SD, _SPATIAL_SD = 0.3, 1.2  # mm, of what a fitted surface misses
 AT_REST = {"pressure": 0.0, "right_pressure": 0.0}
 
 
 def unloaded_volumes(
-    found: cal.Posterior, scene: Scene, cavities: tuple[str, ...] = SURFACES[:2]
+    found: cal.Posterior, scene: em.Scene, cavities: tuple[str, ...] = SURFACES[:2]
 ) -> dict[str, np.ndarray]:
     """Draws of the volume in mL of each cavity without pressure."""
     state = next(iter(found.model.states.states))
     at_rest = {name: 0.0 for name in AT_REST if name in scene.parameter_names}
     return {
-        f"unloaded {name}": found.predict(at_rest, CavityVolume(scene, name), state=state)
+        f"unloaded {name}": found.predict(at_rest, cal.CavityVolume(scene, name), state=state)
         for name in cavities
     }
 
@@ -33,7 +30,7 @@ def unloaded_volumes(
 def twin(
     number: int,
     model: cal.Model,
-    scene: Scene,
+    scene: em.Scene,
     sample: Callable[[cal.Model, dict[str, np.ndarray]], cal.Posterior],
 ) -> Case:
     """Intervals of one twin, and its truth; one that FEM does not solve is drawn again."""
@@ -49,7 +46,7 @@ def twin(
                 empty = empty.at[scene.parameter_names.index(load)].set(value)
             at_rest = _solved(simulator, empty)
             break
-        except SolverError:
+        except em.SolverError:
             continue
     data = {}
     for name, mean in model.observe(u[:, model.observe.nodes], thetas).items():
@@ -59,7 +56,7 @@ def twin(
             noise = known.at(noise.sites)
         data[name] = np.asarray(mean) + noise.simulate(rng, np.shape(mean))
     for name in SURFACES[:2]:
-        cavity = CavityVolume(scene, name)
+        cavity = cal.CavityVolume(scene, name)
         truth[f"unloaded {name}"] = float(cavity(at_rest[cavity.nodes], empty))
     found = sample(*model.given(data))
     held: Case = {}

@@ -16,13 +16,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from studies.common.figures import BLUE, pyplot
 from studies.common.output import Case, Results, parser, run, save
 
 import calibrate as cal
 import emulator as em
-from calibrate.figures import BLUE, pyplot
-from emulator.core.errors import InputError
-from emulator.specimens.states import AXES, States, states
 
 HERE = Path(__file__).parent
 SEED = 3
@@ -46,7 +44,7 @@ SEEN = 0.32
 NOISE = cal.CorrelatedNoise(length=LENGTH, sd_scale=0.2, spatial_sd_scale=0.4)  # kPa
 
 
-def scene_of(states_of_tests: States):
+def scene_of(states_of_tests: Any):
     """The specimen: fibres along x, sheets along y."""
     law = em.find_law(LAW)
     units = {quantity.name: quantity.unit for quantity in law.quantities}
@@ -60,12 +58,12 @@ def scene_of(states_of_tests: States):
 def read(path: Path) -> list[dict[str, str]]:
     """The rows of a table."""
     if not path.is_file():
-        raise InputError(f"{path} does not exist; --data names the folder of the tables")
+        raise em.InputError(f"{path} does not exist; --data names the folder of the tables")
     with path.open(encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 
-def biaxial(rows: list[dict[str, str]]) -> tuple[States, np.ndarray]:
+def biaxial(rows: list[dict[str, str]]) -> tuple[Any, np.ndarray]:
     """States and Cauchy stresses (m, 2) in kPa of Sommer's tests, NaN where not measured.
 
     A row has the stretch and the stress along one axis; the ratio of the strains gives the other.
@@ -78,13 +76,17 @@ def biaxial(rows: list[dict[str, str]]) -> tuple[States, np.ndarray]:
         stretches[k, axis], stretches[k, 1 - axis] = 1.0 + strain, 1.0 + other
         stresses[k, axis] = float(row["y"])
         names.append(f"{row['strain']} at {ratio:g}")
-    return states({"stretch_x": stretches[:, 0], "stretch_y": stretches[:, 1]}, names), stresses
+    return em.specimens.states(
+        {"stretch_x": stretches[:, 0], "stretch_y": stretches[:, 1]}, names
+    ), stresses
 
 
-def shears(amounts: dict[str, np.ndarray]) -> tuple[States, tuple[str, ...]]:
+def shears(amounts: dict[str, np.ndarray]) -> tuple[Any, tuple[str, ...]]:
     """States of simple shears by mode, and the stress that was measured in each."""
-    columns: dict[str, list[float]] = {f"stretch_{a}": [] for a in AXES}
-    planes = {mode: "".join(AXES["fsn".index(letter)] for letter in mode[::-1]) for mode in amounts}
+    columns: dict[str, list[float]] = {f"stretch_{a}": [] for a in "xyz"}
+    planes = {
+        mode: "".join("xyz"["fsn".index(letter)] for letter in mode[::-1]) for mode in amounts
+    }
     columns |= {f"shear_{plane}": [] for plane in planes.values()}
     names = []
     for mode, values in amounts.items():
@@ -95,7 +97,9 @@ def shears(amounts: dict[str, np.ndarray]) -> tuple[States, tuple[str, ...]]:
                     into.append(1.0 if column[-1] in planes[mode] else np.nan)
                 else:
                     into.append(value if column.endswith(planes[mode]) else 0.0)
-    given = states({column: np.array(values) for column, values in columns.items()}, names)
+    given = em.specimens.states(
+        {column: np.array(values) for column, values in columns.items()}, names
+    )
     return given, tuple(f"cauchy_{plane}" for plane in planes.values())
 
 
@@ -115,7 +119,7 @@ def sampled(
     """The posterior of the law's parameters and the noise's sds."""
     model = cal.model(em.homogeneous(scene, incompressible=True), observe, NOISE)
     draws = 100 if quick else 1000
-    options = cal.NUTSOptions(warmup=draws, draws=draws, chains=4)
+    options = cal.samplers.NUTSOptions(warmup=draws, draws=draws, chains=4)
     return cal.sample(model, data, sampler="nuts", options=options, seed=seed)
 
 
@@ -226,7 +230,7 @@ def main() -> None:
         print(json.dumps(judged(case, arguments.judge), indent=2))
         return
     if arguments.data is None:
-        raise InputError("give --data DIR, the folder of the tables")
+        raise em.InputError("give --data DIR, the folder of the tables")
     settings = {"quick": arguments.quick}
     results = Results(arguments.out, SEED, again=arguments.again, settings=settings)
     results.case("biaxial", lambda: from_biaxial(arguments.data, arguments.quick))

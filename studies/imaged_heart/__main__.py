@@ -28,9 +28,6 @@ from studies.imaged_heart.measured import ANGLE, ANGLE_SD, fibre_stress
 
 import calibrate as cal
 import emulator as em
-from emulator.scenes import Scene
-from emulator.scenes.loads import KPA_PER_MMHG
-from emulator.training import Plan, recipe, train
 
 HERE = Path(__file__).parent
 SEED, HEARTS, CERTIFIED = 61, 20, 2
@@ -43,17 +40,18 @@ WAYS = {"unloaded": (True, True), "fibres known": (True, False), "image at rest"
 """Way -> whether the image is unloaded, and whether fibre angles are unknown."""
 
 
-def plan_of(loaded: bool, quick: bool) -> Plan:
+def plan_of(loaded: bool, quick: bool) -> em.Plan:
     """The image at rest is for comparison: a cheaper emulator."""
     runs, order = (12, 1) if quick else (40, 2) if loaded else (30, 2)
-    return replace(recipe("mechanics"), simulations=runs, order=order, seed=SEED)
+    return replace(em.recipe("mechanics"), simulations=runs, order=order, seed=SEED)
 
 
-def prior_of(scene: Scene) -> dict[str, Any]:
+def prior_of(scene: em.Scene) -> dict[str, Any]:
     """Angles about the rule's; the rest by the scene's ranges."""
     ranges = {p.name: (p.low, p.high) for p in scene.parameters}
     return {
-        name: cal.truncated_normal(rule, ANGLE_SD, *ranges[name]) for name, rule in ANGLE.items()
+        name: cal.priors.truncated_normal(rule, ANGLE_SD, *ranges[name])
+        for name, rule in ANGLE.items()
     }
 
 
@@ -65,7 +63,7 @@ def of_heart(number: int, quick: bool) -> Case:
         scene = imaged(one.mesh, loaded=loaded)
         began = perf_counter()
         with tempfile.TemporaryDirectory() as folder:
-            emulator = train(scene, plan_of(loaded, quick), folder)
+            emulator = em.train(scene, plan_of(loaded, quick), folder)
         found["unloading" if loaded else "at rest"] = {"seconds": perf_counter() - began}
         for way, (by_unloading, unknown) in WAYS.items():
             if by_unloading == loaded and (unknown or number < KNOWN):
@@ -78,7 +76,13 @@ def of_heart(number: int, quick: bool) -> Case:
 
 
 def posterior(
-    one: measured.Case, scene: Scene, forward: Any, unknown: bool, quick: bool, *, certified: bool
+    one: measured.Case,
+    scene: em.Scene,
+    forward: Any,
+    unknown: bool,
+    quick: bool,
+    *,
+    certified: bool,
 ) -> Case:
     """What is inferred by one way: 90 % intervals, and whether they hold the truth."""
     began = perf_counter()
@@ -95,7 +99,7 @@ def posterior(
         check_scale=False,
     )
     draws = _QUICK_DRAWS if quick else _DRAWS
-    options = cal.NUTSOptions(warmup=draws, draws=draws, rounds=1 if quick else 2)
+    options = cal.samplers.NUTSOptions(warmup=draws, draws=draws, rounds=1 if quick else 2)
     found = cal.sample(model, data, options=options, seed=SEED, predictions=False)
     values = _quantities(found, scene, observe["volume:filling.endocardium"])
     frame = found.predict({}, observe["volume:filling.endocardium"])
@@ -127,7 +131,7 @@ def posterior(
     return case
 
 
-def _quantities(found: cal.Posterior, scene: Scene, volume: cal.CavityVolume) -> dict[str, Any]:
+def _quantities(found: cal.Posterior, scene: em.Scene, volume: cal.CavityVolume) -> dict[str, Any]:
     """What is asked of a heart, a number a draw."""
     theta = dict(zip(scene.parameter_names, np.asarray(found.thetas()).T, strict=True))
     values = {
@@ -138,7 +142,7 @@ def _quantities(found: cal.Posterior, scene: Scene, volume: cal.CavityVolume) ->
         "epi": theta["epi"],
     }
     if "imaged" in theta:
-        values["pressure in the image"] = theta["imaged"] / KPA_PER_MMHG
+        values["pressure in the image"] = theta["imaged"] / em.loads.KPA_PER_MMHG
     return values
 
 
@@ -167,7 +171,7 @@ def summary(cases: list[Case]) -> Case:
 def _true(case: Case, name: str) -> float:
     truth = case["truth"]
     if name == "pressure in the image":
-        return truth["imaged"] / KPA_PER_MMHG
+        return truth["imaged"] / em.loads.KPA_PER_MMHG
     return truth[{"unloaded volume": "unloaded"}.get(name, name)]
 
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from studies.common.figures import BLUE, ORANGE, VERMILION, pyplot
 from studies.common.output import Case, save
-
-from calibrate.figures import BLUE, ORANGE, VERMILION, pyplot
 
 COLOURS = {"unloaded": BLUE, "fibres known": ORANGE, "image at rest": VERMILION}
 LABELS = {

@@ -12,13 +12,6 @@ from functools import lru_cache
 import numpy as np
 
 import emulator as em
-from emulator.geometry.mesh import Mesh
-from emulator.scenes import Scene
-from emulator.scenes.built_in.ventricles import MYOCARDIUM
-from emulator.scenes.fibre_rules import Helix
-from emulator.scenes.loads import KPA_PER_MMHG, ActiveTension, CavityPressure
-from emulator.scenes.parameter_space import Parameter
-from emulator.scenes.supports import Support
 
 KAPPA, TRANSVERSE = 350.0, 0.3
 ANGLES = ("endo", "epi")
@@ -26,24 +19,28 @@ FILLED = 12.0  # mmHg, the most that a wall is asked to bear without tension
 FINE, COARSE = (10, 24, 2), (5, 12, 1)  # rings, around, layers: of the truth, of the model
 _STATES = ("filling", "systole")
 _IMAGED_UNDER = {"pressure": "imaged", "systolic": "imaged", "tension": "slack"}
-_MMHG = KPA_PER_MMHG
+_MMHG = em.loads.KPA_PER_MMHG
 
-MUSCLE = (*MYOCARDIUM, Parameter("endo", "deg", 40.0, 80.0), Parameter("epi", "deg", -80.0, -40.0))
+MUSCLE = (
+    *em.scenes.left_ventricle(3, 6, 1).parameters[:4],
+    em.Parameter("endo", "deg", 40.0, 80.0),
+    em.Parameter("epi", "deg", -80.0, -40.0),
+)
 """Stiffness, and angles as the built-in ventricle has them."""
-PRESSURE = Parameter("pressure", "kPa", 0.0, FILLED * _MMHG)
-SYSTOLIC = Parameter("systolic", "kPa", 85.0 * _MMHG, 115.0 * _MMHG)
-TENSION = Parameter("tension", "kPa", 60.0, 110.0)
-IMAGED = Parameter("imaged", "kPa", 5.0 * _MMHG, 15.0 * _MMHG)
+PRESSURE = em.Parameter("pressure", "kPa", 0.0, FILLED * _MMHG)
+SYSTOLIC = em.Parameter("systolic", "kPa", 85.0 * _MMHG, 115.0 * _MMHG)
+TENSION = em.Parameter("tension", "kPa", 60.0, 110.0)
+IMAGED = em.Parameter("imaged", "kPa", 5.0 * _MMHG, 15.0 * _MMHG)
 
 
 @lru_cache
-def at_rest() -> Scene:
+def at_rest() -> em.Scene:
     """The true heart without loads; theta is MUSCLE, pressure, tension."""
     scene = em.scenes.left_ventricle(*FINE, angles=ANGLES, kappa=KAPPA)
-    cavity = CavityPressure("endocardium")
+    cavity = em.loads.CavityPressure("endocardium")
     return replace(
         scene,
-        loads=(cavity, ActiveTension(transverse=TRANSVERSE)),
+        loads=(cavity, em.loads.ActiveTension(transverse=TRANSVERSE)),
         parameters=(
             *MUSCLE,
             replace(SYSTOLIC, name="pressure", low=0.0),
@@ -54,12 +51,12 @@ def at_rest() -> Scene:
     )
 
 
-def template() -> Mesh:
+def template() -> em.Mesh:
     """The model's mesh before it is fitted to an image."""
     return em.scenes.left_ventricle(*COARSE).mesh
 
 
-def imaged(mesh: Mesh, *, loaded: bool = True) -> Scene:
+def imaged(mesh: em.Mesh, *, loaded: bool = True) -> em.Scene:
     """The heart of an image, twice: as it fills, and as it contracts.
 
     theta is MUSCLE, the pressure in the image, that of filling, that of systole, and the tension.
@@ -73,18 +70,21 @@ def imaged(mesh: Mesh, *, loaded: bool = True) -> Scene:
         for wall in ("endocardium", "epicardium")
     }
     both = replace(bodies.mesh, facet_sets={**bodies.mesh.facet_sets, **walls})
-    rule = Helix(ANGLES)
+    rule = em.scenes.Helix(ANGLES)
     cavities = {"filling": "pressure", "systole": "systolic"}
-    return Scene(
+    return em.Scene(
         name="imaged_heart",
         mesh=both,
         law=em.find_law("holzapfel_ogden"),
         parameters=(*MUSCLE, *((IMAGED,) if loaded else ()), PRESSURE, SYSTOLIC, TENSION),
         loads=(
-            *(CavityPressure(f"{s}.endocardium", parameter=p) for s, p in cavities.items()),
-            ActiveTension(transverse=TRANSVERSE, within="systole.endocardium"),
+            *(
+                em.loads.CavityPressure(f"{s}.endocardium", parameter=p)
+                for s, p in cavities.items()
+            ),
+            em.loads.ActiveTension(transverse=TRANSVERSE, within="systole.endocardium"),
         ),
-        supports=tuple(Support(f"{state}.base") for state in _STATES),
+        supports=tuple(em.Support(f"{state}.base") for state in _STATES),
         constants={"kappa": KAPPA, **({"slack": 0.0} if loaded else {})},
         fibres=rule.directions(both)[0],
         fibre_rule=rule,

@@ -14,14 +14,14 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 
-from emulator.geometry.mesh import Mesh
+import emulator as em
 
 VOXEL = 1.25
 _APART, _AROUND, _DEGREE = 8.0, 24, 4
 _RIDGE = 1e-3
 
 
-def fitted(mesh: Mesh, rng: np.random.Generator) -> Mesh:
+def fitted(mesh: em.Mesh, rng: np.random.Generator) -> em.Mesh:
     """``mesh``, the wall as it is, as the image has it."""
     base = mesh.nodes[:, 2].max()
     middle = np.array([0.0, 0.0, base - 0.4 * np.ptp(mesh.nodes[:, 2])])
@@ -38,7 +38,7 @@ def fitted(mesh: Mesh, rng: np.random.Generator) -> Mesh:
     return replace(mesh, nodes=mesh.nodes + step)
 
 
-def depth(mesh: Mesh) -> np.ndarray:
+def depth(mesh: em.Mesh) -> np.ndarray:
     """Where each node of a wall of one quadratic layer lies in it: 0, 0.5 or 1, (n,)."""
     found = np.full(len(mesh.nodes), 0.5)
     found[mesh.facet_set("endocardium")], found[mesh.facet_set("epicardium")] = 0.0, 1.0

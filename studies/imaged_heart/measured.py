@@ -26,16 +26,9 @@ from studies.imaged_heart.image import fitted
 
 import calibrate as cal
 import emulator as em
-from emulator.core.errors import InputError, SolverError
-from emulator.fem.energy import displacement_gradient
-from emulator.geometry.facets import Cavity
-from emulator.geometry.mesh import Mesh
-from emulator.scenes import Scene
-from emulator.scenes.fibre_rules import Helix
-from emulator.scenes.loads import KPA_PER_MMHG
 
 VOLUME_SD, STRAIN_SD = 3.0, 0.025  # mL, 1
-READ_SD, FRAME_SD, SYSTOLIC_SD = (mmhg * KPA_PER_MMHG for mmhg in (2.0, 1.0, 5.0))  # kPa
+READ_SD, FRAME_SD, SYSTOLIC_SD = (mmhg * em.loads.KPA_PER_MMHG for mmhg in (2.0, 1.0, 5.0))  # kPa
 ANGLE, ANGLE_SD = {"endo": 60.0, "epi": -60.0}, 8.0  # degrees in the image, and their error
 _LAW = tuple(p.name for p in MUSCLE if p.name not in ANGLE)
 # What a mesh of a noisy image is off by, by trial; told to the model beside the data's error.
@@ -54,15 +47,15 @@ class Case:
     """
 
     truth: dict[str, float]
-    mesh: Mesh
+    mesh: em.Mesh
     data: dict[str, Any]
     sd: dict[str, float]
     chords: np.ndarray
     read: float
 
-    def observed(self, scene: Scene) -> dict[str, cal.measurements.Observation]:
+    def observed(self, scene: em.Scene) -> dict[str, Any]:
         """What is observed of ``scene``, in which a loaded image may be the body at rest."""
-        found: dict[str, cal.measurements.Observation] = {
+        found: dict[str, Any] = {
             "volume:filling.endocardium": cal.CavityVolume(scene, "filling.endocardium"),
             "volume:systole.endocardium": cal.CavityVolume(scene, "systole.endocardium"),
             f"klotz:{self.read:.6g}": cal.KlotzVolume(scene, self.read),
@@ -92,11 +85,11 @@ def heart(seed: int) -> Case:
         truth = _drawn(rng)
         try:
             found = _followed(truth)
-        except SolverError:
+        except em.SolverError:
             continue
         if found is not None and rng.random() < np.exp(-0.5 * _off(truth, found) ** 2):
             return _measured(truth, found, rng)
-    raise InputError(f"no heart in {_TRIES} tries")
+    raise em.InputError(f"no heart in {_TRIES} tries")
 
 
 def _drawn(rng: np.random.Generator) -> dict[str, float]:
@@ -133,7 +126,7 @@ def _followed(truth: dict[str, float]) -> _Followed | None:
     scene = at_rest()
     muscle = [truth[p.name] for p in MUSCLE]
     fibres = np.asarray(scene.fibres_at(np.array([*muscle, 0.0, 0.0])))
-    rule = Helix((truth["endo"], truth["epi"]))
+    rule = em.scenes.Helix((truth["endo"], truth["epi"]))
     plain = replace(
         scene,
         parameters=tuple(p for p in scene.parameters if p.name not in ANGLE),
@@ -149,7 +142,7 @@ def _followed(truth: dict[str, float]) -> _Followed | None:
     for _ in range(_ROUNDS):
         u = solved(truth["imaged"], 0.0)
         there = rule.directions(replace(scene.mesh, nodes=scene.mesh.nodes + u))[0]
-        F = np.eye(3) + np.asarray(displacement_gradient(scene, u))
+        F = np.eye(3) + np.asarray(em.fem.displacement_gradient(scene, u))
         back = np.linalg.solve(F, there[..., None])[..., 0]
         back /= np.linalg.norm(back, axis=-1, keepdims=True)
         turned = np.degrees(np.arccos(np.clip(np.abs(np.sum(back * fibres, axis=-1)), 0.0, 1.0)))
@@ -198,16 +191,16 @@ def _measured(truth: dict[str, float], found: _Followed, rng: np.random.Generato
     }
     read = float(np.clip(data["parameter:imaged"], IMAGED.low, IMAGED.high))
     at = float(np.clip(data["parameter:pressure"], 0.25 * read, read))
-    name, ed = f"klotz:{read:.6g}", Cavity(mesh, "endocardium").rest
+    name, ed = f"klotz:{read:.6g}", em.geometry.Cavity(mesh, "endocardium").rest
     data[name], sd[name] = ed, float(cal.Klotz(ed, read).sd(at))
     truth = truth | {
         "stiffness": float(fibre_stress(*(truth[n] for n in ("a", "b", "a_f", "b_f")))),
-        "unloaded": Cavity(scene.mesh, "endocardium").rest,
+        "unloaded": em.geometry.Cavity(scene.mesh, "endocardium").rest,
     }
     return Case(truth, mesh, data, sd, chords, read)
 
 
-def _chords(mesh: Mesh) -> np.ndarray:
+def _chords(mesh: em.Mesh) -> np.ndarray:
     """Neighbours on each level of the endocardium, (18, 2) nodes."""
     inside = np.unique(mesh.facet_set("endocardium"))
     x, y, z = mesh.nodes[inside].T
@@ -223,7 +216,7 @@ def _chords(mesh: Mesh) -> np.ndarray:
     return np.array(found)
 
 
-def _names(mesh: Mesh, chords: np.ndarray) -> list[str]:
+def _names(mesh: em.Mesh, chords: np.ndarray) -> list[str]:
     """What the chords' lengths are called in the scene, where the body that contracts is second."""
     return ["length:{}:{}".format(*(chord + len(mesh.nodes))) for chord in chords]
 

@@ -14,15 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from studies.common.output import Case, Results, parser
+from studies.common.output import Case, Results, parser, write_json
 from studies.inverse_benchmark import entries, reference, tables
 from studies.inverse_benchmark.entries import ENTRIES, OURS, Entry
 from studies.inverse_benchmark.figure import draw
 from studies.inverse_benchmark.problems import PROBLEMS, SEED, Problem, data_of, scene_of
 from studies.inverse_benchmark.score import score
 
-from emulator.core.errors import InputError
-from emulator.core.store import write_json
+import emulator as em
 
 HERE = Path(__file__).parent
 NEEDS = {"emcee": "emcee", "pymc": "pymc"}  # packages of entries that are not ours
@@ -75,7 +74,7 @@ def scored(folder: Path) -> Case:
             table = tables.read(path, names)
             found[name] = score(table, tables.read(reference.path_of(problem), names))
     if not found:
-        raise InputError(
+        raise em.InputError(
             f"{folder}: no draws; name files by problem, e.g. {next(iter(PROBLEMS))}.csv"
         )
     path = folder / "entry.json"
@@ -157,7 +156,7 @@ def main() -> None:
     if arguments.score is not None:
         try:
             found = scored(arguments.score)
-        except InputError as error:
+        except em.InputError as error:
             raise SystemExit(str(error)) from None
         for name, one in found["scores"].items():
             print(

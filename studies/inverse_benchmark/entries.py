@@ -17,50 +17,45 @@ import numpy as np
 from studies.inverse_benchmark.problems import Problem, data_of, model, scene_of
 
 import calibrate as cal
-from calibrate.samplers import density_of, find_sampler
-from calibrate.statistical_model import Model
-from emulator.fem import Simulator, run_campaign, sobol
-from emulator.surrogates.pod_gp import fit_reduced
-from emulator.surrogates.protocol import ForwardMap
-from emulator.training import recipe, train
+import emulator as em
 
 ENTRIES = Path(__file__).parent / "entries"
 KEPT = 500  # draws of an entry that are written
 RUNS = 60  # FEM runs of the reduced model
 GOOD = 200  # of the emulator
 Draws = dict[str, np.ndarray]
-Method = Callable[[Model, Draws], tuple[Draws, int]]
+Method = Callable[[cal.Model, Draws], tuple[Draws, int]]
 """``method(model, data)``: draws by name, and FEM solves of the sampler."""
 
 
 @lru_cache
-def emulator() -> tuple[ForwardMap, float, int]:
+def emulator() -> tuple[em.ForwardMap, float, int]:
     """Series and discrepancy model of the benchmark's scene: the shipped one is of another mesh."""
-    plan = replace(recipe("mechanics"), simulations=GOOD)
+    plan = replace(em.recipe("mechanics"), simulations=GOOD)
     with TemporaryDirectory() as folder:
-        trained = train(scene_of(), plan, folder)
+        trained = em.train(scene_of(), plan, folder)
     return trained.cache(), trained.record["seconds"], GOOD + 1
 
 
 @lru_cache
-def reduced() -> tuple[ForwardMap, float, int]:
+def reduced() -> tuple[em.ForwardMap, float, int]:
     """POD + Gaussian processes of a campaign of their own."""
     began, scene = time.process_time(), scene_of()
-    fitted = fit_reduced(scene, run_campaign(simulator(), sobol(scene, RUNS, 5)))
+    fitted = em.fit_reduced(scene, em.fem.run_campaign(simulator(), em.fem.sobol(scene, RUNS, 5)))
     return fitted, time.process_time() - began, RUNS
 
 
 @lru_cache
-def simulator() -> Simulator:
+def simulator() -> em.Simulator:
     """FEM on the benchmark's scene."""
-    return Simulator(scene_of())
+    return em.Simulator(scene_of())
 
 
 def sampler(name: str, **options: Any) -> Method:
     """One of the toolkit's samplers."""
 
-    def draw(statistical: Model, data: Draws) -> tuple[Draws, int]:
-        chosen = find_sampler(name)
+    def draw(statistical: cal.Model, data: Draws) -> tuple[Draws, int]:
+        chosen = cal.samplers.SAMPLERS[name]
         posterior = cal.sample(
             statistical, data, sampler=name, options=chosen.options(**options), seed=3,
             predictions=False,
@@ -70,11 +65,11 @@ def sampler(name: str, **options: Any) -> Method:
     return draw
 
 
-def by_emcee(statistical: Model, data: Draws) -> tuple[Draws, int]:
+def by_emcee(statistical: cal.Model, data: Draws) -> tuple[Draws, int]:
     """Goodman and Weare's ensemble by emcee (Foreman-Mackey et al. 2013): 64 walkers."""
     import emcee
 
-    density, walkers, steps = density_of(statistical), 64, 10_000
+    density, walkers, steps = cal.samplers.density_of(statistical), 64, 10_000
     log_density = jax.jit(jax.vmap(lambda z: density.log_density(z, data)))
     start = jax.vmap(density.prior_draw)(jax.random.split(jax.random.key(3), walkers))
     ensemble = emcee.EnsembleSampler(
@@ -89,7 +84,7 @@ def by_emcee(statistical: Model, data: Draws) -> tuple[Draws, int]:
     return {n: np.asarray(v) for n, v in density.constrain(jnp.asarray(z)).items()}, 0
 
 
-def by_pymc(statistical: Model, data: Draws) -> tuple[Draws, int]:
+def by_pymc(statistical: cal.Model, data: Draws) -> tuple[Draws, int]:
     """PyMC, our log density wrapped by PyTensor; compiled by JAX, so that NumPyro's NUTS draws.
 
     PyMC's own NUTS calls Python for every gradient and was not through one problem in 200 s.
@@ -97,7 +92,7 @@ def by_pymc(statistical: Model, data: Draws) -> tuple[Draws, int]:
     import pymc as pm
     from pytensor import wrap_jax
 
-    density = density_of(statistical)
+    density = cal.samplers.density_of(statistical)
     log_density = wrap_jax(lambda z: density.log_density(z, data))
     with pm.Model():
         z = pm.Flat("z", shape=density.dimension)
@@ -118,7 +113,7 @@ class Entry:
     """
 
     name: str
-    forward: Callable[[], tuple[ForwardMap, float, int]]
+    forward: Callable[[], tuple[em.ForwardMap, float, int]]
     method: Method
 
 

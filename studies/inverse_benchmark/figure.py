@@ -2,10 +2,9 @@
 
 from pathlib import Path
 
+from studies.common.figures import COLOURS, pyplot
 from studies.common.output import Case, save
 from studies.inverse_benchmark.problems import PROBLEMS
-
-from calibrate.figures import COLOURS, pyplot
 
 MARKS = "osv^DXP*<>"
 

@@ -12,14 +12,10 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from studies.common.output import write_json
 
 import calibrate as cal
 import emulator as em
-from calibrate.measurements import CavityVolume, Observations, landmarks, spread_landmarks, strains
-from emulator.core.store import write_json
-from emulator.fem import Simulator
-from emulator.scenes import Scene
-from emulator.surrogates.protocol import ForwardMap
 
 DATA = Path(__file__).parent / "data"
 SEED = 2026
@@ -69,23 +65,23 @@ PROBLEMS = {
 
 
 @lru_cache
-def scene_of(*, finer: bool = False) -> Scene:
+def scene_of(*, finer: bool = False) -> em.Scene:
     """The ventricle of linear elements; the model's, or the finer one that data are made on."""
     return em.scenes.left_ventricle(*(FINER if finer else ()), order=1)
 
 
-def observed(problem: Problem, scene: Scene) -> Observations:
+def observed(problem: Problem, scene: em.Scene) -> cal.Observations:
     """What is measured, at the same material points of either mesh."""
-    at = spread_landmarks(scene_of(), POINTS, SEED)
+    at = cal.spread_landmarks(scene_of(), POINTS, SEED)
     made = {
-        "displacement": lambda: landmarks(scene, at),
-        "volume": lambda: CavityVolume(scene),
-        "strain": lambda: strains(scene, COMPONENTS, at),
+        "displacement": lambda: cal.landmarks(scene, at),
+        "volume": lambda: cal.CavityVolume(scene),
+        "strain": lambda: cal.strains(scene, COMPONENTS, at),
     }
-    return Observations({name: made[name]() for name in problem.measured})
+    return cal.Observations({name: made[name]() for name in problem.measured})
 
 
-def model(problem: Problem, forward: ForwardMap) -> cal.Model:
+def model(problem: Problem, forward: em.ForwardMap) -> cal.Model:
     """The statistical model: ``forward``, independent Gaussian noise, the scene's priors."""
     noise = {name: cal.GaussianNoise(sd) for name, sd in problem.sd.items()}
     return cal.model(forward, observed(problem, forward.scene), noise)
@@ -96,7 +92,7 @@ def make(problem: Problem) -> dict[str, Any]:
     scene = scene_of(finer=problem.finer)
     rng = np.random.default_rng([SEED, *problem.name.encode()])
     theta = scene.from_unit(jnp.asarray(rng.uniform(0.1, 0.9, len(scene.parameters))))
-    displacement = Simulator(scene).solve(theta).require_converged(problem.name).displacement
+    displacement = em.Simulator(scene).solve(theta).require_converged(problem.name).displacement
     observe = observed(problem, scene)
     exact = observe(displacement[None, observe.nodes], theta[None])
     values = {n: np.asarray(v) + problem.sd[n] * rng.normal(size=v.shape) for n, v in exact.items()}
@@ -108,7 +104,7 @@ def make(problem: Problem) -> dict[str, Any]:
             {"name": p.name, "unit": p.unit, "low": p.low, "high": p.high, "prior": p.scale}
             for p in scene.parameters
         ],
-        "positions_mm": np.round(spread_landmarks(scene_of(), POINTS, SEED), 9).tolist(),
+        "positions_mm": np.round(cal.spread_landmarks(scene_of(), POINTS, SEED), 9).tolist(),
         "components": list(COMPONENTS),
         "noise_sd": problem.sd,
         "data": {name: value.tolist() for name, value in values.items()},

@@ -18,13 +18,11 @@ from studies.inverse_benchmark import tables
 from studies.inverse_benchmark.problems import Problem, data_of, model
 
 import calibrate as cal
-from calibrate.statistical_model import FEMLikelihood
-from emulator.fem import Simulator
-from emulator.surrogates.protocol import ForwardMap
+import emulator as em
 
 REFERENCES = Path(__file__).parent / "references"
 DRAWS = 1000
-OPTIONS = cal.NUTSOptions(warmup=500, draws=1000, chains=4, rounds=6)
+OPTIONS = cal.samplers.NUTSOptions(warmup=500, draws=1000, chains=4, rounds=6)
 LARGEST_R_HAT, SMALLEST_ESS = 1.01, 0.8
 
 
@@ -33,7 +31,9 @@ def path_of(problem: Problem) -> Path:
     return REFERENCES / f"{problem.name}.csv"
 
 
-def make(problem: Problem, forward: ForwardMap, simulator: Simulator, draws: int = DRAWS) -> Case:
+def make(
+    problem: Problem, forward: em.ForwardMap, simulator: em.Simulator, draws: int = DRAWS
+) -> Case:
     """Draw, weigh and write a reference; how good it is.
 
     Raises
@@ -47,7 +47,7 @@ def make(problem: Problem, forward: ForwardMap, simulator: Simulator, draws: int
     table = posterior.summary()
     all_draws = posterior.draws()
     rows = np.linspace(0, len(next(iter(all_draws.values()))) - 1, draws).astype(int)
-    likelihood = FEMLikelihood(statistical, simulator)
+    likelihood = cal.FEMLikelihood(statistical, simulator)
     found = [
         likelihood({name: values[row] for name, values in all_draws.items()}, data) for row in rows
     ]

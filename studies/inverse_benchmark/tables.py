@@ -4,9 +4,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from studies.common.output import replacing
 
-from emulator.core.errors import InputError
-from emulator.core.store import replacing
+import emulator as em
 
 
 class Table(NamedTuple):
@@ -51,14 +51,14 @@ def read(path: Path, names: tuple[str, ...]) -> Table:
     header = path.read_text().partition("\n")[0].strip().split(",")
     wanted = {*names, *(["weight"] if "weight" in header else [])}
     if set(header) != wanted or len(header) != len(wanted):
-        raise InputError(f"{path}: columns are {', '.join(header)}; expected {', '.join(names)}")
+        raise em.InputError(f"{path}: columns are {', '.join(header)}; expected {', '.join(names)}")
     try:
         rows = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
     except ValueError as error:
-        raise InputError(f"{path}: {error}") from None
+        raise em.InputError(f"{path}: {error}") from None
     if len(rows) < 50 or not np.isfinite(rows).all():
-        raise InputError(f"{path}: {len(rows)} rows; give 50 or more, all of finite numbers")
+        raise em.InputError(f"{path}: {len(rows)} rows; give 50 or more, all of finite numbers")
     weights = rows[:, header.index("weight")] if "weight" in header else np.ones(len(rows))
     if weights.min() < 0.0 or weights.sum() <= 0.0:
-        raise InputError(f"{path}: a weight is negative, or all are 0")
+        raise em.InputError(f"{path}: a weight is negative, or all are 0")
     return Table(rows[:, [header.index(name) for name in names]], weights / weights.sum())

@@ -40,10 +40,6 @@ from studies.living_skin.twins import coverage, inclusion_twin, stiffness_logs, 
 
 import calibrate as cal
 import emulator as em
-from calibrate.statistical_model.errors import with_described_errors
-from emulator.core.errors import InputError
-from emulator.scenes import Scene
-from emulator.training import recipe, train
 
 HERE = Path(__file__).parent
 SEED = 61
@@ -59,12 +55,12 @@ _CERTIFIED = (
 _OTHERWISE = {"field": "field alone", "force": "force alone", "camera": "camera that moves"}
 
 
-def emulated(scene: Scene, folder: Path, runs: int) -> tuple[em.Emulator, Case]:
+def emulated(scene: em.Scene, folder: Path, runs: int) -> tuple[em.Emulator, Case]:
     """The emulator of a scene, and its error; one that is in ``folder`` is kept."""
     if not (folder / "emulator.json").is_file():
         began = perf_counter()
-        plan = replace(recipe("mechanics"), simulations=runs, order=1, seed=SEED)
-        emulator = train(scene, plan, folder, progress=True)
+        plan = replace(em.recipe("mechanics"), simulations=runs, order=1, seed=SEED)
+        emulator = em.train(scene, plan, folder, progress=True)
         em.save_emulator(emulator, folder)
         print(f"trained in {perf_counter() - began:.0f} s", flush=True)
     emulator = em.load(folder, scene)
@@ -78,7 +74,7 @@ def emulated(scene: Scene, folder: Path, runs: int) -> tuple[em.Emulator, Case]:
 
 
 def model_of(
-    scene: Scene, forward: Any, measured: Measured, frames: tuple[str, ...], *,
+    scene: em.Scene, forward: Any, measured: Measured, frames: tuple[str, ...], *,
     camera: bool = False, known_size: float | None = None, **which: bool,
 ) -> tuple[cal.Model, Any]:  # fmt: skip
     """The model of some frames, and their data.
@@ -89,7 +85,7 @@ def model_of(
     observe, data, known = data_of(scene, measured, frames, **which)
     noise = {"displacement": cal.GaussianNoise(sd=SD), FORCE: cal.GaussianNoise(sd=FORCE_SD)}
     modes = [name for name in scene.parameter_names if "mode" in name]
-    prior = {name: cal.truncated_normal(0.0, 1.0, -2.5, 2.5) for name in modes}
+    prior = {name: cal.priors.truncated_normal(0.0, 1.0, -2.5, 2.5) for name in modes}
     noise = {name: each for name, each in noise.items() if name in observe.bases}
     model = cal.model(forward, observe, noise, prior, known=known)
     if "displacement" not in observe.bases:
@@ -107,15 +103,15 @@ def model_of(
                 "kind": "rigid_motion", "of": f"displacement@{frame}",
                 "shift": (CAMERA_SHIFT, CAMERA_SHIFT, 0.0), "turn": (0.0, 0.0, CAMERA_TURN),
             }  # fmt: skip
-    return with_described_errors(model, data, errors)
+    return cal.with_described_errors(model, data, errors)
 
 
 def posterior_of(model: cal.Model, data: Any, sampler: str, quick: bool) -> cal.Posterior:
     """The posterior by NUTS, or near its mode."""
     draws = 50 if quick else 250
-    options: Any = cal.NUTSOptions(warmup=draws, draws=draws, chains=2, rounds=1)
+    options: Any = cal.samplers.NUTSOptions(warmup=draws, draws=draws, chains=2, rounds=1)
     if sampler == "laplace":
-        options = cal.LaplaceOptions(starts=2)
+        options = cal.samplers.LaplaceOptions(starts=2)
     elif sampler == "auto":
         options = None
     return cal.sample(model, data, sampler=sampler, options=options, seed=SEED, predictions=False)
@@ -137,7 +133,7 @@ def told_by(found: cal.Posterior) -> Case:
     }
 
 
-def stiffness_map(found: cal.Posterior, scene: Scene) -> Case:
+def stiffness_map(found: cal.Posterior, scene: em.Scene) -> Case:
     """Mean and sd of the logarithm of mu s, s the factor of each element of the region."""
     middles, of = stiffness_logs(found, scene)
     return {
@@ -174,7 +170,7 @@ def one_layer_of(skin: Skin, data: Path, folder: Path) -> Case:
     }
 
 
-def map_against_fem(scene: Scene, forward: Any, told: Case, count: int = 4) -> Case:
+def map_against_fem(scene: em.Scene, forward: Any, told: Case, count: int = 4) -> Case:
     """Forces of the map and of FEM at theta about a posterior's means, as wide as its sds."""
     rng, simulator = np.random.default_rng(SEED), em.Simulator(scene)
     rows = {name: (row["mean"], row["sd"]) for name, row in told["posterior"].items()}
@@ -229,7 +225,7 @@ def main() -> None:
             print(json.dumps({skin.name: judged(skin, case, arguments.judge)}, indent=2))
         return
     if arguments.data is None:
-        raise InputError("give --data DIR, the folder of the tables")
+        raise em.InputError("give --data DIR, the folder of the tables")
     quick, data = arguments.quick, arguments.data
     keep = arguments.keep or arguments.out / "kept"
     results = Results(arguments.out, SEED, again=arguments.again, settings={"quick": quick})
@@ -243,7 +239,7 @@ def main() -> None:
         return tuple(measured(skin).frame_at(amount) for amount in skin.amounts[:count])
 
     @cache
-    def with_law(skin: Skin, law: str) -> tuple[Scene, Any, Case]:
+    def with_law(skin: Skin, law: str) -> tuple[em.Scene, Any, Case]:
         folder = keep / f"{skin.name}_{law}"
         modes = min(skin.modes, 4) if quick else skin.modes
         scene = scene_of(skin, data, folder, law, modes)

@@ -17,13 +17,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.distance import cdist
+from studies.common.kernels import matern32
 from studies.common.output import Case
 from studies.living_skin.skin import Measured, Skin, force_of, measured_of
 
 import calibrate as cal
-from emulator.core.gaussian_process import matern32
-from emulator.scenes import Scene
-from emulator.surrogates.protocol import ForwardMap
+import emulator as em
 
 LENGTH, ALONG = (
     5.0,
@@ -104,7 +103,7 @@ class Bands:
 
 
 def bands_of(
-    found: cal.Posterior, scene: Scene, forward: ForwardMap, measured: Measured,
+    found: cal.Posterior, scene: em.Scene, forward: em.ForwardMap, measured: Measured,
     frames: tuple[str, ...], amounts: tuple[float, ...], force_amounts: tuple[float, ...],
 ) -> Bands:  # fmt: skip
     """Bands given a posterior of ``frames``."""
@@ -176,5 +175,5 @@ def judged(skin: Skin, case: Case, folder: Path) -> Case:
     return found
 
 
-def _top(scene: Scene) -> Any:
+def _top(scene: em.Scene) -> Any:
     return scene.mesh.nodes[:, 2].max()

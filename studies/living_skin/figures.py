@@ -3,11 +3,10 @@
 from pathlib import Path
 
 import numpy as np
+from studies.common.figures import pyplot
 from studies.common.output import Case, save
 from studies.living_skin.bands import Bands
 from studies.living_skin.skin import HEALTHY, KELOID, measured_of
-
-from calibrate.figures import pyplot
 
 
 def draw(cases: dict[str, Case], data: Path, path: Path) -> None:

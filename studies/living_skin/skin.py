@@ -10,21 +10,6 @@ import numpy as np
 
 import calibrate as cal
 import emulator as em
-from calibrate.measurements.collection import Observations, observations
-from calibrate.measurements.full_field import (
-    FullField,
-    field_data,
-    read_amounts,
-    read_curve,
-    read_full_field,
-    spread_points,
-)
-from emulator.core.cells import read_cells
-from emulator.geometry.io import write_mesh
-from emulator.geometry.random_field import matern_modes
-from emulator.hearts.sheet import mesh_sheet, regions_within
-from emulator.scenes import Scene
-from emulator.surrogates.protocol import ForwardMap
 
 THICKNESS = 1.5  # mm, which nobody measured: only stiffness times thickness is told
 LENGTH, LOG_SD = 10.0, 0.8  # of the field of log stiffness
@@ -87,7 +72,7 @@ def rectangle(left: float, right: float, low: float, high: float) -> np.ndarray:
 def scene_of(
     skin: Skin, data: Path, folder: Path, law: str = "neo_hookean_split", modes: int = 0,
     size: float = _SIZE, layers: int = 1,
-) -> Scene:  # fmt: skip
+) -> em.Scene:  # fmt: skip
     """The scene, written to ``folder``; a mesh that is there is kept."""
     path = folder / "skin.toml"
     if path.is_file():
@@ -99,18 +84,17 @@ def scene_of(
         "moving": rectangle(-_PAD, 0.0, -half, half),
         "fixed": rectangle(skin.gap, end, -half, half),
     }
-    mesh = mesh_sheet(around, THICKNESS, size=size, pads=pads, layers=layers)
+    mesh = em.hearts.mesh_sheet(around, THICKNESS, size=size, pads=pads, layers=layers)
     between = rectangle(-_PAD, end, -_PAD, _PAD)
     outline = data / f"{skin.name}_outline.csv"
     if outline.is_file():
-        cells = read_cells(outline)
-        between = np.array([[cells.number(k, word) for word in "xy"] for k in cells.rows])
-        between = between + _OUTLINE
-    regions = regions_within(mesh, {1: between})
+        cells = np.genfromtxt(outline, delimiter=",", names=True)
+        between = np.stack([cells["x"], cells["y"]], axis=1) + _OUTLINE
+    regions = em.hearts.regions_within(mesh, {1: between})
     field = None
     if modes:  # the constant mode is the region's own factor
-        field = LOG_SD * matern_modes(mesh, LENGTH, modes + 1, regions == 1)[:, 1:]
-    write_mesh(folder / "skin.vtu", mesh, regions=regions, stiffness_modes=field)
+        field = LOG_SD * em.geometry.matern_modes(mesh, LENGTH, modes + 1, regions == 1)[:, 1:]
+    em.write_mesh(folder / "skin.vtu", mesh, regions=regions, stiffness_modes=field)
     path.write_text(_scene_file(skin, law, modes, scar=outline.is_file()))
     return em.find_scene(str(path))
 
@@ -145,7 +129,7 @@ def _scene_file(skin: Skin, law: str, modes: int, scar: bool) -> str:
     return "\n".join(lines) + "\n"
 
 
-def force_of(scene: Scene, forward: ForwardMap) -> Callable[[jax.Array], jax.Array]:
+def force_of(scene: em.Scene, forward: em.ForwardMap) -> Callable[[jax.Array], jax.Array]:
     """The force in N on the moving pad along x that a map predicts, as a function of theta."""
     force = cal.Reaction(scene, "moving", "x").through(forward)
     assert force is not None  # the pad's motion is a parameter, and the skin rests as it lies
@@ -161,7 +145,7 @@ class Measured:
     chosen : the numbers of the points that are data.
     """
 
-    field: FullField
+    field: cal.fields.FullField
     amounts: dict[str, float]
     force: Callable[[float], float]
     chosen: np.ndarray
@@ -173,11 +157,13 @@ class Measured:
 
 def measured_of(skin: Skin, data: Path, points: int) -> Measured:
     """Read a test from a folder."""
-    field = read_full_field(
+    field = cal.fields.read_full_field(
         data / f"{skin.name}_points.csv", data / f"{skin.name}_displacements.csv"
     )
-    amounts = read_amounts(data / f"{skin.name}_pads.csv", "moving_ux")
-    at, force = read_curve(data / f"{skin.name}_force.csv", "moving_ux_mm", "force_N", [1.0])
+    amounts = cal.fields.read_amounts(data / f"{skin.name}_pads.csv", "moving_ux")
+    at, force = cal.fields.read_curve(
+        data / f"{skin.name}_force.csv", "moving_ux_mm", "force_N", [1.0]
+    )
 
     def mean_force(amount: float) -> float:
         low, high = amount - _PERIOD / 2, min(amount + _PERIOD / 2, float(at[-1]))
@@ -187,23 +173,23 @@ def measured_of(skin: Skin, data: Path, points: int) -> Measured:
 
     x = field.points[:, 0]
     inner = np.flatnonzero((x > skin.inner[0]) & (x < skin.inner[1]))
-    chosen = inner[spread_points(field.points[inner], points)]
+    chosen = inner[cal.fields.spread_points(field.points[inner], points)]
     motion = {frame: abs(value) for frame, value in amounts.items()}
     return Measured(field, motion, mean_force, chosen)
 
 
 def data_of(
-    scene: Scene, measured: Measured, frames: tuple[str, ...], *,
+    scene: em.Scene, measured: Measured, frames: tuple[str, ...], *,
     field: bool = True, force: bool = True,
-) -> tuple[Observations, dict[str, Any], dict[str, float]]:  # fmt: skip
+) -> tuple[cal.Observations, dict[str, Any], dict[str, float]]:  # fmt: skip
     """Observations, data and known motions of frames; of the field, the force or both."""
     seen = measured.field.only(frames, measured.chosen)
     parts, data = dict[str, Any](), dict[str, Any]()
     if field:
-        observe, data = field_data(scene, seen, measured.amounts)
+        observe, data = cal.fields.field_data(scene, seen, measured.amounts)
         parts |= observe.parts
     for frame in frames if force else ():
         parts[f"{FORCE}@{frame}"] = cal.Reaction(scene, "moving", "x")
         data[f"{FORCE}@{frame}"] = np.array(measured.force(measured.amounts[frame]))
     known = {f"pull@{frame}": measured.amounts[frame] for frame in frames}
-    return observations(parts), data, known
+    return cal.Observations(parts), data, known

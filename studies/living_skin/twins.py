@@ -1,6 +1,6 @@
 """Twins: skins of FEM whose truth is known, inferred with errors that correlate and without."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -13,12 +13,6 @@ from studies.living_skin.skin import FORCE, Measured
 
 import calibrate as cal
 import emulator as em
-from calibrate.measurements.full_field import field_data
-from calibrate.statistical_model.errors import with_described_errors
-from emulator.core.errors import SolverError
-from emulator.scenes import Scene
-from emulator.scenes.tissue import stiffness_of
-from emulator.surrogates.protocol import ForwardMap
 
 SIZE = 0.05  # mm, of the twins' errors that correlate
 _ERROR = {
@@ -26,13 +20,26 @@ _ERROR = {
 }  # fmt: skip
 
 
+def _stiffness(scene: em.Scene, values: Mapping[str, jax.Array]) -> jax.Array:
+    """Return the factor (m,) on each element's stiffness: its region's, and its modes'."""
+    factor = jnp.ones(len(scene.mesh.elements))
+    for label in () if scene.regions is None else np.unique(scene.regions):
+        factor = jnp.where(scene.regions == label, factor * values[f"stiffness_{label}"], factor)
+    if scene.stiffness_modes is not None:
+        sizes = [
+            values[f"stiffness_mode_{k}"] for k in range(1, scene.stiffness_modes.shape[1] + 1)
+        ]
+        factor = factor * jnp.exp(scene.stiffness_modes @ jnp.stack(sizes))
+    return factor
+
+
 def twins_of(
-    scene: Scene, forward: ForwardMap, measured: Measured, frames: tuple[str, ...], count: int,
-    results: Results,
+    scene: em.Scene, forward: em.ForwardMap, measured: Measured, frames: tuple[str, ...],
+    count: int, results: Results,
 ) -> list[Case]:  # fmt: skip
     """Inference of ``count`` skins without a field of stiffness, seen as the keloid was."""
     seen = measured.field.only(frames, measured.chosen)
-    observe, shapes = field_data(scene, seen, measured.amounts)
+    observe, shapes = cal.fields.field_data(scene, seen, measured.amounts)
     parts = {
         **observe.parts,
         **{f"{FORCE}@{frame}": cal.Reaction(scene, "moving", "x") for frame in frames},
@@ -47,8 +54,8 @@ def twins_of(
     stand_in = {name: np.asarray(values) for name, values in shapes.items()}
     stand_in |= {f"{FORCE}@{f}": np.array(measured.force(measured.amounts[f])) for f in frames}
     # Modes of the error do not depend on data: one model, and its programs, serve all twins.
-    truth_of, _ = with_described_errors(plain, stand_in, {"missed": {**_ERROR, "sd": SIZE}})
-    told, _ = with_described_errors(plain, stand_in, {"missed": {**_ERROR, "sd_scale": 0.1}})
+    truth_of, _ = cal.with_described_errors(plain, stand_in, {"missed": {**_ERROR, "sd": SIZE}})
+    told, _ = cal.with_described_errors(plain, stand_in, {"missed": {**_ERROR, "sd_scale": 0.1}})
     independent = model({"sd_scale": 0.1}).given(stand_in)[0]
     simulator = em.Simulator(scene)
 
@@ -62,7 +69,7 @@ def twins_of(
             try:
                 fields = [simulator.solve(t).require_converged().displacement for t in thetas]
                 break
-            except SolverError:
+            except em.SolverError:
                 continue
         u = jnp.stack(fields)[:, truth_of.observe.nodes]
         means = truth_of.fem_means(key, draw, truth_of.observe(u, thetas))
@@ -82,7 +89,7 @@ def twins_of(
 def _inside(
     model: cal.Model, data: dict[str, np.ndarray], truth: dict[str, float], sampler: str
 ) -> Case:
-    options = cal.LaplaceOptions(draws=300, starts=2) if sampler == "laplace" else None
+    options = cal.samplers.LaplaceOptions(draws=300, starts=2) if sampler == "laplace" else None
     found = cal.sample(model, data, sampler=sampler, options=options, seed=1, predictions=False)
     rows = {}
     for name, values in found.draws().items():
@@ -92,7 +99,7 @@ def _inside(
     return rows
 
 
-def stiffness_logs(found: cal.Posterior, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+def stiffness_logs(found: cal.Posterior, scene: em.Scene) -> tuple[np.ndarray, np.ndarray]:
     """Middles (m, 2) mm of the region's elements, and draws (s, m) of the log of mu s in kPa."""
     thetas = found.thetas(found.model.states.states[0])
     thetas = thetas[np.linspace(0, len(thetas) - 1, 150).astype(int)]
@@ -103,15 +110,14 @@ def stiffness_logs(found: cal.Posterior, scene: Scene) -> tuple[np.ndarray, np.n
     @jax.jit
     def logs(theta: jax.Array) -> jax.Array:
         values = scene.resolve(theta)
-        stiffness = stiffness_of(scene.regions, scene.stiffness_modes, values)
-        assert stiffness is not None
+        stiffness = _stiffness(scene, values)
         return jnp.log(stiffness[inside] * values[first])
 
     return middles, np.asarray(jax.vmap(logs)(thetas))
 
 
 def inclusion_twin(
-    scene: Scene, forward: ForwardMap, model_of: Callable[..., Any], measured: Measured,
+    scene: em.Scene, forward: em.ForwardMap, model_of: Callable[..., Any], measured: Measured,
     frames: tuple[str, ...], number: int,
 ) -> Case:  # fmt: skip
     """A scar with a round stiff inclusion, of which the model with modes of stiffness is not told.
@@ -147,7 +153,7 @@ def inclusion_twin(
         for name, mean in means.items()
     }
     told, _ = model_of(scene, forward, measured, frames)
-    options = cal.LaplaceOptions(draws=300, starts=2)
+    options = cal.samplers.LaplaceOptions(draws=300, starts=2)
     found = cal.sample(told, data, sampler="laplace", options=options, seed=1, predictions=False)
     places, logs = stiffness_logs(found, scene)
     real = np.log(mu * np.where(stiff[scar], 4.0 * factor, 4.0))

@@ -21,20 +21,16 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.ticker import FixedFormatter, FixedLocator
+from studies.common.figures import COLOURS, pyplot
 from studies.common.output import Case, Results, parser, save
 from studies.common.two_meshes import Pair, on_two_meshes
 
 import calibrate as cal
 import emulator as em
-from calibrate.figures import COLOURS, pyplot
-from calibrate.measurements import CavityVolume, Observations, landmarks, spread_landmarks
-from calibrate.samplers import NUTSOptions
-from emulator.fem import Simulator
-from emulator.scenes import Scene
 
 HERE = Path(__file__).parent
 SEED = 23
-OPTIONS = NUTSOptions(warmup=300, draws=500, chains=2, rounds=4, r_hat=1.02, ess=300.0)
+OPTIONS = cal.samplers.NUTSOptions(warmup=300, draws=500, chains=2, rounds=4, r_hat=1.02, ess=300.0)
 FEM_RUNS = 100  # of a certificate
 LIMIT = 0.5  # posterior sd: what a certificate may accept
 
@@ -47,7 +43,7 @@ class Body:
     0 where none is measured.
     """
 
-    scene: Callable[[], Scene]
+    scene: Callable[[], em.Scene]
     landmarks: tuple[int, ...]
     noise: tuple[float, ...]
     volume: float = 0.0
@@ -83,11 +79,11 @@ def model_of(emulator: em.Emulator, at: np.ndarray, noise: float, volume: float)
     parts: dict[str, Any] = {}
     sd: dict[str, float] = {}
     if len(at):
-        parts["displacement"], sd["displacement"] = landmarks(scene, at), noise
+        parts["displacement"], sd["displacement"] = cal.landmarks(scene, at), noise
     if volume > 0.0:
-        parts["volume"], sd["volume"] = CavityVolume(scene), noise * volume
+        parts["volume"], sd["volume"] = cal.CavityVolume(scene), noise * volume
     told = {name: cal.GaussianNoise(value) for name, value in sd.items()}
-    return cal.model(emulator.cache(), Observations(parts), told)
+    return cal.model(emulator.cache(), cal.Observations(parts), told)
 
 
 def moments(posterior: cal.Posterior) -> tuple[np.ndarray, np.ndarray]:
@@ -100,7 +96,7 @@ def moments(posterior: cal.Posterior) -> tuple[np.ndarray, np.ndarray]:
 def examine(name: str, count: int, noise: float, r: int) -> Case:
     """One posterior: what its certificate predicts, and what the finer mesh does."""
     body, pair = BODIES[name], emulators(name)
-    at = spread_landmarks(pair.coarse.scene, max(count, 1), SEED)[:count]
+    at = cal.spread_landmarks(pair.coarse.scene, max(count, 1), SEED)[:count]
     here, there = (model_of(each, at, noise, body.volume) for each in pair)
     rng = np.random.default_rng([SEED, r, count, *name.encode()])
     truth = pair.fine.scene.from_unit(jnp.asarray(rng.random(len(here.names))))
@@ -112,7 +108,7 @@ def examine(name: str, count: int, noise: float, r: int) -> Case:
         for n, v in exact.items()
     }
     posterior = cal.sample(here, data, options=OPTIONS, seed=r, predictions=False)
-    certificate = cal.certify(posterior, Simulator(pair.coarse.scene), draws=FEM_RUNS, seed=r)
+    certificate = cal.certify(posterior, em.Simulator(pair.coarse.scene), draws=FEM_RUNS, seed=r)
     mesh = certificate.evidence.mesh
     (mean, sd), (finer, finer_sd) = (
         moments(posterior),

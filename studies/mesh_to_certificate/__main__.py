@@ -16,15 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from studies.common.output import save, study_header
+from studies.common.figures import pyplot
+from studies.common.output import save, study_header, write_json
+from studies.common.twins import twin
 
-from calibrate.figures import pyplot
-from calibrate.measurements.data import write_data
-from calibrate.project import Run, make_data
-from emulator.catalogue import find_scene
-from emulator.core.store import write_json
-from emulator.geometry.generators.ellipsoid import EllipsoidalWall, truncated_ellipsoid
-from emulator.geometry.io import write_mesh
+import calibrate as cal
+import emulator as em
 
 HERE = Path(__file__).parent
 SEED = 4
@@ -33,8 +30,8 @@ TRUTH = {"a": 0.33, "b": 2.2, "a_f": 6.0, "b_f": 2.4, "pressure": 1.0}
 NOISE = {"displacement": 0.3, "volume": 1.0}
 # Semi-axes of the wall (mm), rings, around, layers.
 VENTRICLES = {
-    "human": (EllipsoidalWall(23.0, 58.0, 34.0, 65.0, 20.0), (8, 28, 3)),
-    "dilated, thin": (EllipsoidalWall(30.0, 62.0, 38.0, 68.0, 22.0), (10, 36, 2)),
+    "human": (em.generators.EllipsoidalWall(23.0, 58.0, 34.0, 65.0, 20.0), (8, 28, 3)),
+    "dilated, thin": (em.generators.EllipsoidalWall(30.0, 62.0, 38.0, 68.0, 22.0), (10, 36, 2)),
 }
 STAGES = {
     "init": "init (a first scene file)",
@@ -62,15 +59,11 @@ def timed(folder: Path, *words: str) -> tuple[float, dict[str, Any]]:
 
 def measure(folder: Path) -> int:
     """The data file of the body, by FEM; the number of nodes of its mesh."""
-    run = Run(
-        str(folder / "body.toml"),
-        truth=TRUTH,
-        observe="landmarks:24+volume",
-        noise=NOISE,
-        seed=SEED,
-    )
-    scene = find_scene(run.scene)
-    write_data(folder / "data.csv", *make_data(run, scene))
+    scene = em.find_scene(str(folder / "body.toml"))
+    theta = np.array([TRUTH[name] for name in scene.parameter_names])
+    u = em.Simulator(scene).solve(theta).require_converged("the data").displacement
+    observe, _, data = twin(scene, "landmarks:24+volume", NOISE, theta, u, SEED)
+    cal.write_data(folder / "data.csv", observe, data)
     return len(scene.mesh.nodes)
 
 
@@ -80,8 +73,8 @@ def one(name: str, size: tuple[int, int, int]) -> dict[str, Any]:
     known = ("body.toml", "--emulator", "emulator", "--data", "data.csv", "--noise", *noise)
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
-        mesh = truncated_ellipsoid(VENTRICLES[name][0], *size, grading=1.5)
-        write_mesh(folder / "body.msh", mesh)
+        mesh = em.generators.truncated_ellipsoid(VENTRICLES[name][0], *size, grading=1.5)
+        em.write_mesh(folder / "body.msh", mesh)
         seconds = {"init": timed(folder, "init", "body.msh")[0]}
         nodes = measure(folder)
         recipe = ("--recipe", "mechanics", "--out", "emulator")

@@ -18,16 +18,11 @@ from typing import Any
 
 import jax
 import numpy as np
-from studies.common.output import save, study_header
+from studies.common.figures import pyplot
+from studies.common.output import save, study_header, write_json
 
 import calibrate as cal
 import emulator as em
-from calibrate.figures import pyplot
-from calibrate.measurements import parse_observation
-from emulator.core.store import write_json
-from emulator.released.scenes import published_tests, units
-from emulator.surrogates import Emulator
-from emulator.training import recipe, train
 
 HERE = Path(__file__).parent
 SEED = 5
@@ -39,14 +34,16 @@ CERTIFIED = 200
 
 def reproduction(model: str, root: Path, fem_runs: int) -> dict[str, Any]:
     """Errors of the released network of ``model`` in our code."""
-    emulator, scale = em.released_network(model, root), units(model).length
-    thetas, tests = published_tests(model, root)
+    emulator, scale = em.released_network(model, root), em.released.units(model).length
+    thetas, tests = em.released.published_tests(model, root)
     predict = jax.jit(jax.vmap(emulator.cache()))
     predicted = np.asarray(predict(thetas))
     stored = np.load(root / model / "trained" / "displacement-predicted.npy") * scale
     largest = np.abs(stored).max(axis=(1, 2))
     off = np.abs(predicted[: len(stored)] - stored).max(axis=(1, 2)) / largest
-    energy = np.asarray(jax.jit(jax.vmap(em.potential_energy(emulator.scene)))(predicted, thetas))
+    energy = np.asarray(
+        jax.jit(jax.vmap(em.fem.potential_energy(emulator.scene)))(predicted, thetas)
+    )
     found: dict[str, Any] = {
         "model": model,
         "off_the_released_code": float(off.max()),
@@ -57,8 +54,8 @@ def reproduction(model: str, root: Path, fem_runs: int) -> dict[str, Any]:
         errors = np.linalg.norm(predicted - tests.displacement, axis=-1)
         found["err_u_stored_mm"] = float(np.median(errors))
     some = thetas[:fem_runs]
-    solved = em.fem.solve_together(em.Simulator(emulator.scene), some)
-    assert bool(solved.converged.all())
+    solved = em.fem.run_campaign(em.Simulator(emulator.scene), some)
+    assert len(solved.theta) == len(some)
     errors = np.linalg.norm(predicted[: len(some)] - solved.displacement, axis=-1)
     found |= {"err_u_fem_mm": float(np.median(errors)), "fem_runs": len(some)}
     cached = jax.jit(emulator.cache())
@@ -70,10 +67,10 @@ def reproduction(model: str, root: Path, fem_runs: int) -> dict[str, Any]:
     return found | {"value_ms": 1e3 * float(np.median(times))}
 
 
-def ours(scene: em.Scene, runs: int) -> Emulator:
+def ours(scene: em.Scene, runs: int) -> em.Emulator:
     """An emulator of the same scene from ``runs`` FEM runs, without a network."""
     with tempfile.TemporaryDirectory() as folder:
-        return train(scene, replace(recipe("mechanics"), simulations=runs), folder)
+        return em.train(scene, replace(em.recipe("mechanics"), simulations=runs), folder)
 
 
 def posteriors(root: Path, quick: bool, keep: Any) -> list[dict[str, Any]]:
@@ -84,7 +81,7 @@ def posteriors(root: Path, quick: bool, keep: Any) -> list[dict[str, Any]]:
     emulators = {"released network": released, f"{FEM_RUNS} FEM runs": None}
     emulators[f"{FEM_RUNS} FEM runs"] = ours(scene, 10 if quick else FEM_RUNS)
     trained = time.perf_counter() - begin
-    observe = parse_observation(scene, "landmarks:24+volume", SEED)
+    observe = cal.parse_observation(scene, "landmarks:24+volume", SEED)
     theta = scene.centre
     exact = observe(simulator(theta)[observe.nodes][None], theta[None])
     rows = []
@@ -98,9 +95,9 @@ def posteriors(root: Path, quick: bool, keep: Any) -> list[dict[str, Any]]:
                 emulator.cache(), observe, {n: cal.GaussianNoise(sd=s) for n, s in sd.items()}
             )
             options = (
-                cal.NUTSOptions(warmup=100, draws=100, chains=2, rounds=1)
+                cal.samplers.NUTSOptions(warmup=100, draws=100, chains=2, rounds=1)
                 if quick
-                else cal.NUTSOptions(warmup=300, draws=500, chains=2, rounds=3)
+                else cal.samplers.NUTSOptions(warmup=300, draws=500, chains=2, rounds=3)
             )
             posterior = cal.sample(model, data, options=options, seed=SEED, predictions=False)
             sampled = time.perf_counter() - begin

@@ -12,7 +12,7 @@ from time import perf_counter
 
 import jax.numpy as jnp
 import numpy as np
-from studies.common.output import Case, Results, parser, run
+from studies.common.output import Case, Results, parser, run, table
 from studies.sheep_myocardium import cube, figures, population, twins
 from studies.sheep_myocardium.campaign import QUICK, Campaign, Plan, of_law
 from studies.sheep_myocardium.checked import decided, told
@@ -29,10 +29,9 @@ from studies.sheep_myocardium.inference import (
     settled,
 )
 from studies.sheep_myocardium.solver import finer, without_mesh
+from tqdm import tqdm
 
-from calibrate.cli.output import table
-from emulator.core.display import counting
-from emulator.core.errors import InputError
+import emulator as em
 
 HERE = Path(__file__).parent
 SEED = 32
@@ -136,7 +135,7 @@ def judge(results: Results, folder: Path) -> Case:
     """Hearts that were kept apart, beside the 90 % bands of the population's eighth heart."""
     known = next((c for c in results.cases if c["name"] == "population"), None)
     if known is None:
-        raise InputError("no population in results.json; run the study with --data first")
+        raise em.InputError("no population in results.json; run the study with --data first")
     draws = np.asarray(known["eighth"])
     rng = np.random.default_rng(SEED)
     cases: Case = {}
@@ -144,7 +143,7 @@ def judge(results: Results, folder: Path) -> Case:
     for each in apart:
         cases[each.name] = _judged(each, draws, rng)
     if not cases:
-        raise InputError(f"{folder} has no heart that the population was not made of")
+        raise em.InputError(f"{folder} has no heart that the population was not made of")
     return cases
 
 
@@ -163,7 +162,7 @@ def _judged(one: Heart, draws: np.ndarray, rng: np.random.Generator) -> Case:
         z = rng.normal(size=(3, len(omega), body.amounts.shape[1]))
         curves, made = body.curves, {mode: z[mode][:0] for mode in range(3)}
         open_modes, factors = [*made], np.ones(body.amounts.shape)
-        with counting(total=len(x), desc=f"{one.name}, cube {body.number + 1}", unit="draw") as bar:
+        with tqdm(total=len(x), desc=f"{one.name}, cube {body.number + 1}", unit="draw") as bar:
             for rows in np.array_split(np.arange(len(x)), _BLOCKS):
                 if not open_modes:
                     break

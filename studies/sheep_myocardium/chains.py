@@ -12,9 +12,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from numpyro.infer.hmc import HMCState, hmc
 from numpyro.infer.util import constrain_fn, potential_energy
+from studies.common.output import cores
 from studies.sheep_myocardium.moves import Modes, moved
-
-from emulator.core.machine import cores
 
 _PLACES = 4  # of which a chain begins at the likeliest
 _ACCEPTED, _DEPTH = 0.9, 8  # of NUTS: acceptance its step size adapts to, doublings of a trajectory

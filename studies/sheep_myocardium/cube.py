@@ -30,11 +30,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.fem.energy import point_energy
-from emulator.geometry.generators.box import box
-from emulator.mechanics.laws import find_law
-from emulator.scenes import Parameter, Scene, Support
-from emulator.scenes.tissue import FibreAngles, Tissue, turned
+import emulator as em
 
 CELLS = 3
 """Along an edge, of six quadratic tetrahedra each: 343 nodes."""
@@ -42,22 +38,25 @@ KAPPA = 100.0  # kPa: shear moduli are about 1
 AMOUNTS = ("shear_y", "shear_z", "stretch")
 """Of the modes of a cube, in their order."""
 MATERIAL = (
-    Parameter("a", "kPa", 0.05, 5.0, "log"),
-    Parameter("b", "", 0.5, 40.0, "log"),
-    Parameter("a_f", "kPa", 0.001, 12.0),
-    Parameter("b_f", "", 0.5, 40.0, "log"),
-    Parameter("a_s", "kPa", 0.001, 6.0),
-    Parameter("b_s", "", 0.5, 40.0, "log"),
-    Parameter("a_fs", "kPa", 0.001, 3.0),
-    Parameter("b_fs", "", 0.5, 40.0, "log"),
+    em.Parameter("a", "kPa", 0.05, 5.0, "log"),
+    em.Parameter("b", "", 0.5, 40.0, "log"),
+    em.Parameter("a_f", "kPa", 0.001, 12.0),
+    em.Parameter("b_f", "", 0.5, 40.0, "log"),
+    em.Parameter("a_s", "kPa", 0.001, 6.0),
+    em.Parameter("b_s", "", 0.5, 40.0, "log"),
+    em.Parameter("a_fs", "kPa", 0.001, 3.0),
+    em.Parameter("b_fs", "", 0.5, 40.0, "log"),
 )
 SPREAD = 3.0
 """Degrees by which fibres of the formula's cube miss their angles, sd."""
 _NODES = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]]) * np.sqrt(3.0)
 _WEIGHTS = np.array([2, 1, 1, 1, 1]) / 6.0
-ANGLES = (Parameter("in_plane", "deg", -45.0, 45.0), Parameter("out_of_plane", "deg", -45.0, 45.0))
+ANGLES = (
+    em.Parameter("in_plane", "deg", -45.0, 45.0),
+    em.Parameter("out_of_plane", "deg", -45.0, 45.0),
+)
 """By which the fibres of a cube miss the direction it was cut along: towards s, then towards n."""
-_MOVED = tuple(Parameter(name, "", -0.7, 0.7) for name in AMOUNTS)
+_MOVED = tuple(em.Parameter(name, "", -0.7, 0.7) for name in AMOUNTS)
 # Fibre, sheet and normal are axes 0, 1, 2; of each cube those along x (the plates' normal), y, z.
 _CUT = ((0, 1, 2), (1, 0, 2), (2, 0, 1))
 
@@ -71,42 +70,48 @@ def _frame(cube: int) -> tuple[np.ndarray, ...]:
     return f, s, np.cross(f, s), np.cross(f, n)
 
 
-def scene(cube: int, sizes: np.ndarray, cells: int = CELLS) -> Scene:
+def scene(cube: int, sizes: np.ndarray, cells: int = CELLS) -> em.Scene:
     """The cube numbered ``cube`` from 0, of ``sizes`` (3,) mm as in the files."""
     width, depth, height = sizes
-    mesh = box((height, width, depth), (cells,) * 3, 2)
+    mesh = em.generators.box((height, width, depth), (cells,) * 3, 2)
     f, s, across, along = (np.tile(v, (len(mesh.elements), 1)) for v in _frame(cube))
     one = np.ones(len(mesh.elements))
     plates = tuple(
-        Support("right", height * np.eye(3)["xyz".index(axis)], axis, amount=amount)
+        em.Support("right", height * np.eye(3)["xyz".index(axis)], axis, amount=amount)
         for axis, amount in zip("yzx", AMOUNTS, strict=True)
     )
-    return Scene(
+    return em.Scene(
         f"cube {cube + 1}",
         mesh,
-        find_law("holzapfel_ogden_orthotropic"),
+        em.find_law("holzapfel_ogden_orthotropic"),
         (*MATERIAL, *ANGLES, *_MOVED),
-        supports=(Support("left"), *plates),
+        supports=(em.Support("left"), *plates),
         constants={"kappa": KAPPA},
         fibres=f,
         sheets=s,
-        angles=(FibreAngles(across, {"in_plane": one}), FibreAngles(along, {"out_of_plane": one})),
+        angles=(
+            em.scenes.FibreAngles(across, {"in_plane": one}),
+            em.scenes.FibreAngles(along, {"out_of_plane": one}),
+        ),
         dilatation="mean",
     )
 
 
 @lru_cache
-def _law_of() -> Scene:
+def _law_of() -> em.Scene:
     """A scene of a cube, for its law and its box."""
     return scene(0, np.ones(3), cells=1)
 
 
 def turned_to(number: int, x: jax.Array) -> jax.Array:
     """Fibre and sheet (2, 3) of a cube at a position (p,) in the box."""
-    f, s, across, along = _frame(number)
-    one = np.ones(())
-    angles = (FibreAngles(across, {"in_plane": one}), FibreAngles(along, {"out_of_plane": one}))
-    return turned(jnp.stack([f, s]), angles, _law_of().resolve(theta_of(x)))
+    f, s, *axes = _frame(number)
+    directions, values = jnp.stack([f, s]), _law_of().resolve(theta_of(x))
+    for axis, name in zip(axes, ("in_plane", "out_of_plane"), strict=True):
+        angle, n = jnp.deg2rad(values[name]), jnp.asarray(axis)
+        across, along = jnp.cross(n, directions), (directions @ n)[:, None] * n
+        directions = along + jnp.cos(angle) * (directions - along) + jnp.sin(angle) * across
+    return directions
 
 
 def theta_of(x: jax.Array) -> jax.Array:
@@ -145,16 +150,18 @@ def formula(x: jax.Array, H: jax.Array, C: jax.Array, area: jax.Array) -> jax.Ar
     x : (c, p) positions in the box, of which the material is the first's. H, C : (c, 3, j, 3, 3),
         see :func:`homogeneous`. area : (c,) mm2 of a plate.
     """
-    stress = jax.grad(point_energy(_law_of(), theta_of(x[0])))
+    law, values = _law_of().law, _law_of().resolve(theta_of(x[0]))
+    parameters = [values[name] for name in law.parameters]
+    stress = jax.grad(lambda h, d: law.energy(em.laws.Strain(h, directions=d), *parameters))
     cubes, count, nodes = len(x), H.shape[1] * H.shape[2], len(_NODES)
     missed = np.zeros((nodes, x.shape[1]))
     missed[:, len(MATERIAL) :] = SPREAD / ANGLES[0].high * _NODES
-    turned = [jax.vmap(turned_to, (None, 0))(k, x[k] + missed) for k in range(cubes)]
+    directions = [jax.vmap(turned_to, (None, 0))(k, x[k] + missed) for k in range(cubes)]
     # All points are one batch, which is a tenth faster than one a cube.
     shape = (cubes, nodes, count)
-    each = jnp.broadcast_to(jnp.stack(turned)[:, :, None], (*shape, 2, 3))
+    each = jnp.broadcast_to(jnp.stack(directions)[:, :, None], (*shape, 2, 3))
     every = jnp.broadcast_to(H.reshape(cubes, 1, count, 3, 3), (*shape, 3, 3))
     flat = (every.reshape(-1, 3, 3), each.reshape(-1, 2, 3))
-    P = jax.vmap(lambda h, d: stress(h, Tissue(d)))(*flat).reshape(*shape, 3, 3)
+    P = jax.vmap(stress)(*flat).reshape(*shape, 3, 3)
     forces = jnp.einsum("m,ckij,cmkij->ck", _WEIGHTS, C.reshape(cubes, count, 3, 3), P)
     return 1e-3 * area[:, None] * forces  # kPa mm2 is mN

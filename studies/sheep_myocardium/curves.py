@@ -22,21 +22,17 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from studies.common.output import cores
 from studies.sheep_myocardium import cube, process
 from studies.sheep_myocardium.experiment import Curve, Heart
 from studies.sheep_myocardium.process import Known, Process
 from threadpoolctl import threadpool_limits
 
+import calibrate as cal
 import emulator as em
-from emulator.core.errors import SolverError
-from emulator.core.machine import cores
-from emulator.fem.campaign import at_once, in_order
-from emulator.fem.derivatives import Quantity
-from emulator.fem.newton import NewtonOptions
-from emulator.fem.reactions import SupportForce
 
 _TOLERANCE = 1e-6  # of forces without slopes, which are then known to 1e-8
-_AXES = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))  # along which each mode moves
+_AXES = "yzx"  # along which each mode moves
 
 
 class Runs(NamedTuple):
@@ -67,7 +63,7 @@ class Cube:
     def simulator(self) -> em.Simulator:
         """FEM of the cube. From rest 4 steps of Newton's method do; with stress iterates 7."""
         scene = cube.scene(self.number, self.sizes, self.cells)
-        options = NewtonOptions(stress_iterates=False)
+        options = em.fem.NewtonOptions(stress_iterates=False)
         if not self.sloping:  # slopes are those of an equilibrium; forces alone need a step less
             options = replace(options, tolerance=_TOLERANCE)
         return em.Simulator(scene, options)
@@ -94,8 +90,10 @@ class Cube:
         if not len(x):
             j = self.amounts[list(modes)].size
             return Runs(x, np.empty((0, j)), np.empty((0, j, self.unknowns)))
-        run, workers = partial(self._run, modes), at_once(self.simulator)
-        each = in_order(lambda row: run(jnp.asarray(row)), iter(x), workers)
+        run = partial(self._run, modes)
+        first = run(jnp.asarray(x[0]))  # compiles what the others use
+        with ThreadPoolExecutor(cores()) as pool:
+            each = [first, *pool.map(lambda row: run(jnp.asarray(row)), x[1:])]
         return Runs(x, *(np.stack(part) for part in zip(*each, strict=True)))
 
     def _run(self, modes: Sequence[int], x: jax.Array) -> list[np.ndarray]:
@@ -113,21 +111,21 @@ class Cube:
         found = self.simulator.path(thetas)
         # Behind a point that did not converge the path is lost.
         sound = np.logical_and.accumulate(np.asarray(found.converged))
-        rates = 0.5e-3 * np.asarray(self.body.space.rates(thetas)[:, : self.unknowns])
+        rates = 0.5 * np.asarray(self.body.space.rates(thetas)[:, : self.unknowns])
         force, slopes = np.full(len(amounts), np.nan), np.full(rates.shape, np.nan)
         for k in np.flatnonzero(sound):
             value, rising = self._forces[mode](found.displacement[k], thetas[k])
-            force[k] = 1e-3 * value  # mN
+            force[k] = value
             slopes[k] = rising[: self.unknowns] * rates[k]
         return [force, slopes]
 
     @cached_property
     def _forces(self) -> list[Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]]:
-        """Of each mode, the force along its motion in mN with its gradient (p + 3,) in theta."""
+        """Of each mode, the force along its motion in N with its gradient (p + 3,) in theta."""
 
-        def along(axis: tuple[float, float, float]) -> Quantity:
-            force = SupportForce(self.body, "right", axis)
-            return lambda u, theta: force(u[force.nodes], theta)
+        def along(axis: str) -> Callable[[jax.Array, jax.Array], jax.Array]:
+            force = cal.Reaction(self.body, "right", axis)
+            return lambda u, theta: force.evaluate(u[force.nodes], theta)
 
         each = [along(axis) for axis in _AXES]
         if self.sloping:
@@ -257,6 +255,6 @@ def _known(k: int, runs: Runs, H: jax.Array, C: jax.Array, area: jax.Array) -> K
     ratio = runs.force / formula
     sound = (np.isfinite(ratio) & (ratio > 0.0)).all(axis=1)
     if not sound.sum() > 0.5 * len(sound):
-        raise SolverError(f"{(~sound).sum()} of {len(sound)} runs of cube {k + 1} failed")
+        raise em.SolverError(f"{(~sound).sum()} of {len(sound)} runs of cube {k + 1} failed")
     slopes = (runs.slopes / runs.force[..., None] - rising / formula[..., None])[sound]
     return process.known(k, runs.x[sound], np.log(ratio[sound]), slopes, H[k])

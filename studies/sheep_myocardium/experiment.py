@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from emulator.core.errors import InputError
+import emulator as em
 
 MODES = ("FS", "FN", "FF", "SF", "SN", "SS", "NF", "NS", "NN")
 """In the files' order, three a cube: normal of the glued faces, direction of motion."""
@@ -58,7 +58,7 @@ def hearts(folder: Path) -> list[Heart]:
     """
     found = [heart(each) for each in sorted(folder.glob("TSL*")) if each.is_dir()]
     if not found:
-        raise InputError(f"{folder} has no folders TSL1, TSL2, ...; get them from {_SOURCE}")
+        raise em.InputError(f"{folder} has no folders TSL1, TSL2, ...; get them from {_SOURCE}")
     return found
 
 
@@ -67,7 +67,7 @@ def heart(folder: Path) -> Heart:
     sizes = _table(folder / "WDH_Params.csv", 9, skip=0)
     low, high = _EDGES
     if sizes.shape != (1, 9) or not ((low < sizes) & (sizes < high)).all():
-        raise InputError(
+        raise em.InputError(
             f"{folder / 'WDH_Params.csv'}: expected 9 edge lengths in mm in one row, each of "
             f"{low:g} to {high:g}"
         )
@@ -78,7 +78,7 @@ def heart(folder: Path) -> Heart:
     k = int(np.argmax(largest))
     low, high = _FORCES
     if not low < largest[k] < high:
-        raise InputError(
+        raise em.InputError(
             f"{folder / f'ForceStrain_M{k + 1}.csv'}: forces reach {largest[k]:g}, the largest of "
             f"this heart; expected N, {low:g} to {high:g} of a centimetre of muscle"
         )
@@ -91,9 +91,9 @@ def curve(path: Path, mode: str) -> Curve:
     table = _table(path, 3 if sheared else 2, skip=1)
     amount, force = table[:, 0], table[:, 1]
     if not (np.diff(amount) > 0.0).all() or not amount[0] < 0.0 < amount[-1]:
-        raise InputError(f"{path}: amounts do not rise from below 0 to above it")
+        raise em.InputError(f"{path}: amounts do not rise from below 0 to above it")
     if np.abs(amount).max() > 1.0:
-        raise InputError(
+        raise em.InputError(
             f"{path}: amounts reach {np.abs(amount).max():g}; expected fractions, not percent or mm"
         )
     fractions = np.arange(1, LEVELS + 1) / LEVELS
@@ -105,13 +105,13 @@ def curve(path: Path, mode: str) -> Curve:
 def _table(path: Path, columns: int, *, skip: int) -> np.ndarray:
     """Numbers (r, columns) of a file."""
     if not path.is_file():
-        raise InputError(f"{path} is missing; get it from {_SOURCE}")
+        raise em.InputError(f"{path} is missing; get it from {_SOURCE}")
     try:
         table = np.loadtxt(path, delimiter=",", skiprows=skip, ndmin=2)
     except ValueError as error:
-        raise InputError(f"{path} is not a table of numbers: {error}") from error
+        raise em.InputError(f"{path} is not a table of numbers: {error}") from error
     if table.shape[1] != columns or not np.isfinite(table).all() or not len(table):
-        raise InputError(
+        raise em.InputError(
             f"{path} has {table.shape[1]} columns, or values that are not finite; expected "
             f"{columns} columns of finite numbers"
         )

@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from studies.common.figures import BLACK, BLUE, COLOURS, VERMILION, pyplot
 from studies.common.output import Case, save
 from studies.sheep_myocardium import cube
 from studies.sheep_myocardium.experiment import MODES, Heart
-
-from calibrate.figures import BLACK, BLUE, COLOURS, VERMILION, pyplot
 
 
 def modes(hearts: Sequence[Heart], cases: Sequence[Case], out: Path) -> None:

@@ -14,14 +14,13 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 from scipy.special import logsumexp
-from studies.common.output import Case
+from studies.common.output import Case, cores
 from studies.sheep_myocardium.curves import Fit
 from studies.sheep_myocardium.doubts import UNKNOWN, doubts, known_to
 from studies.sheep_myocardium.experiment import MODES
 from studies.sheep_myocardium.inference import Found, covariances, sample
 
-from calibrate.importance.weights import smoothed
-from emulator.core.machine import cores
+import calibrate as cal
 
 _HEAVIEST = 0.7  # Pareto shape of the weights' tail
 _LEVELS = (0.05, 0.5, 0.95)
@@ -51,7 +50,7 @@ def held_out(found: Found, seed: int, fitted: Fit | None = None) -> dict[str, Pr
 
     def apart(k: int) -> Prediction:
         densities = found.log_likelihoods[:, k]
-        log_weights, shape = smoothed(-densities)
+        log_weights, shape = cal.array_stats.psislw(densities)  # negates them
         heavy = not shape < _HEAVIEST
         used = _without(MODES[k], found, fitted, seed + k) if heavy and fitted is not None else None
         if used is not None:

@@ -28,14 +28,14 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
+from studies.common.kernels import matern32
 from studies.sheep_myocardium import cube
 from studies.sheep_myocardium.chains import Drawn, by_chain, marked, sampler, side_by_side
 from studies.sheep_myocardium.curves import Emulated, forces
 from studies.sheep_myocardium.experiment import MODES, Heart
 from studies.sheep_myocardium.moves import EXPLORING, Modes, joined, modes, unknown
 
-from calibrate.model_error.systematic import curve_correlation
-from calibrate.samplers.diagnostics import least_ess, r_hat
+import calibrate as cal
 
 CELL = 3e-3  # N, noise of the load cell
 POINT = 0.03  # of a force, at each point for itself
@@ -60,6 +60,24 @@ _ANGLES = (_CUBES, len(cube.ANGLES))
 TIMES = 4
 """As many draws as steps of warm-up, at most."""
 ANGLE_SD = ANGLE / cube.ANGLES[0].high  # in half widths of the box
+
+
+def r_hat(values: np.ndarray) -> float:
+    """Return the rank-normalised split R-hat of ``values`` (chains, draws)."""
+    return float(cal.array_stats.rhat(values, chain_axis=0, draw_axis=1))
+
+
+def least_ess(values: np.ndarray) -> float:
+    """Return the effective number of draws of ``values`` (chains, draws), in bulk or tails."""
+    axes = {"chain_axis": 0, "draw_axis": 1}
+    bulk = cal.array_stats.ess(values, method="bulk", **axes)
+    return float(min(bulk, cal.array_stats.ess(values, method="tail", prob=(0.05, 0.95), **axes)))
+
+
+def _along_curve(amounts: jax.Array, length: Any) -> jax.Array:
+    """Return the correlation of a curve's points: half constant, half Matern's."""
+    distance = (amounts[..., :, None] - amounts[..., None, :]) / length
+    return 0.5 + 0.5 * matern32(distance**2)
 
 
 class Seen(NamedTuple):
@@ -125,7 +143,7 @@ def covariances(amounts: jax.Array, mean: jax.Array, omega: jax.Array) -> jax.Ar
     """Covariances (..., j, j) in N2 of modes' data with ``mean`` (..., j)."""
     length = 0.5 * jnp.abs(amounts).max(axis=-1)[..., None, None]
     products = mean[..., :, None] * mean[..., None, :]
-    alike = omega**2 * products * curve_correlation(amounts, length, 0.5)
+    alike = omega**2 * products * _along_curve(amounts, length)
     own = jnp.eye(mean.shape[-1]) * mean[..., None, :] ** 2
     return alike + POINT**2 * own + CELL**2 * jnp.eye(mean.shape[-1])
 

@@ -20,10 +20,16 @@ import numpyro.distributions as dist
 from studies.sheep_myocardium import cube
 from studies.sheep_myocardium.campaign import Campaign
 from studies.sheep_myocardium.chains import by_chain, marked, sampler, side_by_side
-from studies.sheep_myocardium.inference import ANGLE_SD, Seen, log_likelihoods, means, seen
+from studies.sheep_myocardium.inference import (
+    ANGLE_SD,
+    Seen,
+    least_ess,
+    log_likelihoods,
+    means,
+    r_hat,
+    seen,
+)
 from studies.sheep_myocardium.moves import unknown
-
-from calibrate.samplers.diagnostics import least_ess, r_hat
 
 NAMES = (*(p.name for p in cube.MATERIAL), "omega")
 _CENTRE = np.log([0.5, 8.0, 0.8, 8.0, 0.8, 8.0, 0.3, 8.0, 0.25])

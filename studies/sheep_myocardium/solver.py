@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from studies.common.output import replacing
 from studies.sheep_myocardium.cube import CELLS
 from studies.sheep_myocardium.curves import Cube, Runs
 from studies.sheep_myocardium.experiment import Heart
-
-from emulator.core.store import replacing
 
 FINER = 5
 """Cells along an edge of the finer mesh: 1331 nodes."""

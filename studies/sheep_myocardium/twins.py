@@ -14,13 +14,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
-from studies.common.output import Case
+from studies.common.output import Case, cores
 from studies.sheep_myocardium.campaign import Campaign
 from studies.sheep_myocardium.experiment import MODES, Heart
 from studies.sheep_myocardium.held_out import replicated
 from studies.sheep_myocardium.inference import ORTHOTROPIC, parameters, sample
-
-from emulator.core.machine import cores
 
 _OUTER = (0.05, 0.95)
 _A_HEART = 6

@@ -11,17 +11,13 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from studies.common.output import Case, Results, parser, run, save
+from studies.common.figures import pyplot
+from studies.common.output import Case, Results, parser, run, save, table
 from studies.silicone_beam import beam
 from studies.silicone_beam.experiment import BLIND, FORCE, Measured, measured, recordings
 
 import calibrate as cal
 import emulator as em
-from calibrate.cli.output import table
-from calibrate.figures import pyplot
-from calibrate.model_error import ModelError
-from emulator.core.errors import InputError
-from emulator.training import recipe
 
 HERE = Path(__file__).parent
 SEED = 31
@@ -34,7 +30,7 @@ def posterior(
     model: cal.Model, seen: Measured, simulator: em.Simulator, draws: int, runs: int
 ) -> tuple[cal.Posterior, Case]:
     """The posterior of the moduli with its certificate."""
-    options = cal.NUTSOptions(draws=draws)
+    options = cal.samplers.NUTSOptions(draws=draws)
     data = {name: beam.data(seen)[name] for name in model.observe.parts}
     found = cal.sample(model, data, options=options, seed=SEED)
     certificate = cal.certify(found, simulator, draws=runs, seed=SEED)
@@ -51,7 +47,7 @@ def posterior(
 def what_was_unknown(found: cal.Posterior, seen: Measured) -> Case:
     """Posterior mean and sd of hand, rig, pins and the loose marker, in mm and degrees."""
     error = found.model.error
-    assert isinstance(error, ModelError)
+    assert error is not None
     draws = flat(found)
     each = []
     for k in range(0, len(draws["mu"]), max(1, len(draws["mu"]) // 200)):
@@ -104,7 +100,7 @@ def twins(forward: Any, seen: Measured, count: int, rng: np.random.Generator) ->
         for name, sd in beam.NOISE.items():
             twin[name] += rng.normal(0.0, sd, twin[name].shape)
         for kind, others in ((model, False), (beam.model(forward, seen, known_rig=True), True)):
-            options = cal.NUTSOptions(draws=500, warmup=500, chains=2)
+            options = cal.samplers.NUTSOptions(draws=500, warmup=500, chains=2)
             told = {name: twin[name] for name in kind.observe.parts}
             found = cal.sample(kind, told, options=options, seed=SEED + k, predictions=False)
             mu = flat(found)["mu"]
@@ -127,10 +123,10 @@ def judge(results: Results, folder: Path) -> Case:
     """The recordings that were kept apart, beside what was written before."""
     told = next((c for c in results.cases if c["name"] == "prediction"), None)
     if told is None:
-        raise InputError("no prediction in results.json; run the study with --data first")
+        raise em.InputError("no prediction in results.json; run the study with --data first")
     others = [p for p in sorted(folder.glob("beam_load*.c3d")) if "load52" not in p.name]
     if not others:
-        raise InputError(f"{folder} has no recordings of another force, beam_load*.c3d")
+        raise em.InputError(f"{folder} has no recordings of another force, beam_load*.c3d")
     found: Case = {"recordings": [p.name for p in others]}
     places = np.mean([recordings(p.parent, p.name)[0].static for p in others], axis=0)
     for name, (low, _, high) in told["markers"].items():
@@ -200,7 +196,7 @@ def main() -> None:
     seen = measured(words.data)
     scene = beam.scene((6, 2, 2) if words.quick else (12, 3, 3))
     with tempfile.TemporaryDirectory() as folder:
-        trained = em.train(scene, recipe("mechanics"), folder)
+        trained = em.train(scene, em.recipe("mechanics"), folder)
     forward, simulator = trained.cache(), em.Simulator(scene)
     draws, runs = (250, 50) if words.quick else (1000, 200)
     rng = np.random.default_rng(SEED)

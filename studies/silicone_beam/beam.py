@@ -15,14 +15,7 @@ from studies.silicone_beam.experiment import (
 )
 
 import calibrate as cal
-from calibrate.model_error import ModelError, Systematic
-from calibrate.model_error.kinds import rotation_of
-from calibrate.statistical_model import Model
-from emulator.geometry.generators.box import box, toward_ends
-from emulator.mechanics.laws import find_law
-from emulator.scenes import Parameter, Scene, Support
-from emulator.scenes.loads import Force, Gravity
-from emulator.surrogates.protocol import ForwardMap
+import emulator as em
 
 TIP = "markers:right"
 WEIGHT, LOADED, BASE = f"{TIP}@weight", f"{TIP}@loaded", "markers:left@loaded"
@@ -36,39 +29,48 @@ PIN = 1.0  # mm, where the markers are in the mesh's frame
 LOOSE = 1.0  # mm: one of the clamp's markers does not fit the others' distances
 
 
-def scene(cells: tuple[int, int, int] = (12, 3, 3)) -> Scene:
+def rotation_of(points: np.ndarray, displacement: np.ndarray) -> np.ndarray:
+    """Return the rotation (3, 3) that fits the displacement of ``points`` (d, 3) best."""
+    deformed = points + displacement
+    U, _, V = np.linalg.svd((deformed - deformed.mean(axis=0)).T @ (points - points.mean(axis=0)))
+    return U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ V))]) @ V
+
+
+def scene(cells: tuple[int, int, int] = (12, 3, 3)) -> em.Scene:
     """Nearly incompressible silicone, clamped at x = 0, a force on the free end's upper edge."""
-    mesh = box((LENGTH, WIDTH, WIDTH), cells, 2, toward_ends(cells[0], 1.5, ("left",)))
+    mesh = em.generators.box(
+        (LENGTH, WIDTH, WIDTH), cells, 2, em.generators.toward_ends(cells[0], 1.5, ("left",))
+    )
     edge = np.intersect1d(mesh.node_set("right"), mesh.node_set("top"))
-    return Scene(
+    return em.Scene(
         name="silicone beam",
         mesh=replace(mesh, node_sets={**mesh.node_sets, "edge": edge}),
-        law=find_law("neo_hookean_split"),
+        law=em.find_law("neo_hookean_split"),
         parameters=(
-            Parameter("mu", "kPa", 40.0, 200.0, "log"),
-            Parameter("kappa", "kPa", 1e3, 1e5, "log"),
-            Parameter("hung", "", 0.0, 1.05),
+            em.Parameter("mu", "kPa", 40.0, 200.0, "log"),
+            em.Parameter("kappa", "kPa", 1e3, 1e5, "log"),
+            em.Parameter("hung", "", 0.0, 1.05),
         ),
         loads=(
-            Gravity(density=DENSITY, direction=(0.0, 0.0, -1.0), acceleration=9.81),
-            Force("edge", (0.0, 0.0, -1.0), amount="hung"),
+            em.loads.Gravity(density=DENSITY, direction=(0.0, 0.0, -1.0), acceleration=9.81),
+            em.loads.Force("edge", (0.0, 0.0, -1.0), amount="hung"),
         ),
-        supports=(Support("left"),),
+        supports=(em.Support("left"),),
         dilatation="mean",
     )
 
 
-def hand(observed: Iterable[str], seen: Measured) -> Systematic:
+def hand(observed: Iterable[str], seen: Measured) -> cal.model_error.Systematic:
     """Displacements are from where a hand held the tip: its error is the same in all of them."""
-    return cal.rigid_motion("hand", dict.fromkeys(observed, seen.rest), *HAND)
+    return cal.model_error.rigid_motion("hand", dict.fromkeys(observed, seen.rest), *HAND)
 
 
-def rig(places: Mapping[str, np.ndarray]) -> Systematic:
+def rig(places: Mapping[str, np.ndarray]) -> cal.model_error.Systematic:
     """Camera or clamp, seen at ``places`` (d, 3) mm, have moved since the first experiment."""
-    return cal.rigid_motion("rig", places, *RIG, about=CLAMP.mean(axis=0))
+    return cal.model_error.rigid_motion("rig", places, *RIG, about=CLAMP.mean(axis=0))
 
 
-def pins(displacements: Mapping[str, np.ndarray], seen: Measured) -> Systematic:
+def pins(displacements: Mapping[str, np.ndarray], seen: Measured) -> cal.model_error.Systematic:
     """A marker that stands elsewhere by d moves by (R - I) d more where the tip has turned by R."""
     modes = {
         name: np.stack(
@@ -76,19 +78,19 @@ def pins(displacements: Mapping[str, np.ndarray], seen: Measured) -> Systematic:
         )
         for name, u in displacements.items()
     }
-    return Systematic(tuple(f"pins {axis}" for axis in "xyz"), modes)
+    return cal.model_error.Systematic(tuple(f"pins {axis}" for axis in "xyz"), modes)
 
 
-def unknowns(seen: Measured) -> tuple[Systematic, ...]:
+def unknowns(seen: Measured) -> tuple[cal.model_error.Systematic, ...]:
     """What is not known of the measurement besides its noise."""
     tip = {WEIGHT: seen.weight, LOADED: seen.loaded}
     moved = rig({LOADED: seen.rest + seen.loaded, BASE: CLAMP + seen.clamp})
     second = LOOSE * np.eye(3)[:, None] * np.array([0.0, 1.0, 0.0])[:, None]
-    loose = Systematic(tuple(f"loose {axis}" for axis in "xyz"), {BASE: second})
+    loose = cal.model_error.Systematic(tuple(f"loose {axis}" for axis in "xyz"), {BASE: second})
     return hand(tip, seen), moved, pins(tip, seen), loose
 
 
-def model(forward: ForwardMap, seen: Measured, *, known_rig: bool = False) -> Model:
+def model(forward: em.ForwardMap, seen: Measured, *, known_rig: bool = False) -> cal.Model:
     """Modulus and bulk modulus from both experiments.
 
     known_rig : leave out all that is not known of the measurement, and with it the clamp's markers,
@@ -110,8 +112,8 @@ def data(seen: Measured) -> dict[str, np.ndarray]:
 
 
 def predict(
-    forward: ForwardMap,
-    calibrated: Model,
+    forward: em.ForwardMap,
+    calibrated: cal.Model,
     seen: Measured,
     draws: Mapping[str, np.ndarray],
     rng: np.random.Generator,
@@ -134,7 +136,7 @@ def predict(
 
     stayed, moved = [], []
     error = calibrated.error
-    assert isinstance(error, ModelError)
+    assert error is not None
     for k in range(len(draws["mu"])):
         draw = {name: jnp.asarray(values[k]) for name, values in draws.items()}
         means, _ = calibrated.predict(draw)
@@ -150,6 +152,6 @@ def predict(
     return {"rig where it was": np.array(stayed), "rig moved again": np.array(moved)}
 
 
-def _sum(error: Systematic, values: Mapping[str, float]) -> np.ndarray:
+def _sum(error: cal.model_error.Systematic, values: Mapping[str, float]) -> np.ndarray:
     (modes,) = error.modes.values()
     return np.tensordot([values[name] for name in error.names], modes, axes=1)

@@ -11,7 +11,7 @@ from pathlib import Path
 import c3d
 import numpy as np
 
-from emulator.core.errors import InputError
+import emulator as em
 
 SOURCE = "github.com/srl-ethz/diffPD_sim2real, commit 825e7b7, python/realbeam_experiments"
 LENGTH, WIDTH = 100.0, 30.0  # mm
@@ -44,7 +44,9 @@ def read(path: Path) -> Recording:
         reader = c3d.Reader(file)
         frames = np.stack([points[:, :3] for _, points, _ in reader.read_frames()])
     if frames.shape[1] != 6:
-        raise InputError(f"{path}: {frames.shape[1]} markers; expected 6, three of them on the tip")
+        raise em.InputError(
+            f"{path}: {frames.shape[1]} markers; expected 6, three of them on the tip"
+        )
     positions = 1e3 * frames @ _AXES.T  # the files are in m
     held, static = positions[:_HELD].mean(axis=0), positions[-_STATIC:].mean(axis=0)
     return Recording(held[:3], static[:3], static[3:])
@@ -54,7 +56,7 @@ def recordings(folder: Path, pattern: str) -> list[Recording]:
     """The repeats of an experiment, in the files' order."""
     files = sorted(folder.glob(pattern))
     if not files:
-        raise InputError(
+        raise em.InputError(
             f"{folder} has no {pattern}; the recordings are those of {SOURCE}: give --data DIR"
         )
     return [read(path) for path in files]

@@ -12,16 +12,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from studies.common.output import save, study_header
+from studies.common.figures import pyplot
+from studies.common.output import save, study_header, write_json
 from studies.stability import emulation
 from studies.stability.cases import CASES
 from studies.stability.judge import TOLERANCE
 from studies.stability.solver.case import SEED
 from studies.stability.workers import study
 
-from calibrate.figures import pyplot
-from emulator import Status
-from emulator.core.store import write_json
+import emulator as em
 
 HERE = Path(__file__).parent
 LIMIT = 120.0  # seconds for one case, compilation and judgement included
@@ -83,7 +82,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     save(figure, path)
 
 
-NAMED = {status.name for status in Status} | set(COLOURS)
+NAMED = {status.name for status in em.fem.Status} | set(COLOURS)
 
 
 def check(rows: list[dict[str, Any]]) -> None:

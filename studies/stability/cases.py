@@ -5,7 +5,7 @@ from typing import Any
 
 from studies.stability import emulation, solver
 
-from emulator.core.errors import InputError, SolverError
+import emulator as em
 
 FAMILIES = (
     "nearly incompressible",
@@ -55,7 +55,7 @@ def outcome(name: str) -> dict[str, Any]:
         status = type(error).__name__
         return row | {
             "status": status
-            if isinstance(error, (InputError, SolverError))
+            if isinstance(error, (em.InputError, em.SolverError))
             else f"exception {status}",
             "time_s": time.perf_counter() - begin,
             "note": str(error).splitlines()[0][:160],

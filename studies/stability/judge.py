@@ -21,11 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 import sparsax
 
-from emulator import Scene, Simulator, potential_energy
-from emulator.fem.energy import strain_energy
-from emulator.geometry.discretisation import quadrature_points
-from emulator.scenes.loads import CavityPressure, FollowerPressure, Gravity, Traction
-from emulator.scenes.supports import ElasticSupport
+import emulator as em
 
 TOLERANCE = 1e-6
 SMALLEST = 1e-13  # of a body's size, which positions in double precision hardly tell from none
@@ -139,7 +135,7 @@ ENERGIES: dict[str, Callable[..., jax.Array]] = {
 
 
 # ---- forces ------------------------------------------------------------------------------------
-def deformation(scene: Scene) -> tuple[Callable[[jax.Array], jax.Array], np.ndarray, np.ndarray]:
+def deformation(scene: em.Scene) -> tuple[Callable[[jax.Array], jax.Array], np.ndarray, np.ndarray]:
     """``F`` at every point as a function of ``u``: (m, q, 3, 3); weights (m, q); values (q, a)."""
     order = scene.mesh.order
     points, weights = _POINTS[order]
@@ -155,7 +151,7 @@ def deformation(scene: Scene) -> tuple[Callable[[jax.Array], jax.Array], np.ndar
     return F, np.linalg.det(jacobian) * weights, values
 
 
-def internal_force(scene: Scene, u: jax.Array, theta: jax.Array) -> jax.Array:
+def internal_force(scene: em.Scene, u: jax.Array, theta: jax.Array) -> jax.Array:
     """Nodal forces (n, 3) in mN of the strained elements and of the springs."""
     F, weights, _ = deformation(scene)
     if scene.law.name not in ENERGIES:
@@ -190,38 +186,41 @@ def internal_force(scene: Scene, u: jax.Array, theta: jax.Array) -> jax.Array:
     local = jnp.asarray(u)[scene.mesh.elements]
     force = _collect(scene, scene.mesh.elements, jax.grad(energy)(local))
     for support in scene.supports:
-        if isinstance(support, ElasticSupport):
+        if isinstance(support, em.supports.ElasticSupport):
             force = force + _springs(scene, support, u)
     return force
 
 
-def fibres_of(scene: Scene, shape: tuple[int, ...]) -> jax.Array:
+def fibres_of(scene: em.Scene, shape: tuple[int, ...]) -> jax.Array:
     """Fibres at this file's points, (m, q, 3); a scene lists its own points in another order."""
     if scene.fibres is None:
         return jnp.zeros((*shape, 3))
-    here, there = _POINTS[scene.mesh.order][0], quadrature_points(scene.mesh.order)[:, 1:]
+    here, there = (
+        _POINTS[scene.mesh.order][0],
+        em.geometry.quadrature_points(scene.mesh.order)[:, 1:],
+    )
     apart = np.linalg.norm(here[:, None] - there, axis=-1)
     return jnp.asarray(scene.fibres_at_points[:, apart.argmin(axis=1)])
 
 
-def external_force(scene: Scene, u: jax.Array, theta: jax.Array) -> jax.Array:
+def external_force(scene: em.Scene, u: jax.Array, theta: jax.Array) -> jax.Array:
     """Nodal forces (n, 3) in mN of the loads."""
     values = scene.resolve(theta)
     force = jnp.zeros((len(scene.mesh.nodes), 3))
     for load in scene.loads:
-        if isinstance(load, Gravity):
+        if isinstance(load, em.loads.Gravity):
             _, weights, shapes = deformation(scene)
             along = np.asarray(load.direction) / np.linalg.norm(load.direction)
             # g/cm3 times m/s2 is 1e-3 kPa/mm.
             body = 1e-3 * load.density * load.acceleration * along
             local = jnp.einsum("mq,qa,i->mai", weights, shapes, body)
             force = force + _collect(scene, scene.mesh.elements, local)
-        elif isinstance(load, Traction):
+        elif isinstance(load, em.loads.Traction):
             facets, area, N = _surface(scene, load.facet_set, None)
             size = jnp.linalg.norm(area, axis=-1)
             local = jnp.einsum("kq,qa,i->kai", size, N, jnp.asarray(load.traction))
             force = force + _collect(scene, facets, local)
-        elif isinstance(load, CavityPressure | FollowerPressure):
+        elif isinstance(load, em.loads.CavityPressure | em.loads.FollowerPressure):
             facets, area, N = _surface(scene, load.facet_set, u)
             p = values[load.parameter] if load.pressure is None else load.pressure
             force = force + _collect(scene, facets, -p * jnp.einsum("kqi,qa->kai", area, N))
@@ -231,7 +230,7 @@ def external_force(scene: Scene, u: jax.Array, theta: jax.Array) -> jax.Array:
 
 
 def _surface(
-    scene: Scene, name: str, u: jax.Array | None
+    scene: em.Scene, name: str, u: jax.Array | None
 ) -> tuple[np.ndarray, jax.Array, np.ndarray]:
     """Facets (k, a); weighted area vectors (k, q, 3) of the deformed surface; values (q, a)."""
     facets, order = scene.mesh.facet_set(name), scene.mesh.order
@@ -243,7 +242,7 @@ def _surface(
     return facets, area * _TRIANGLE_WEIGHTS[:, None], N
 
 
-def _springs(scene: Scene, support: ElasticSupport, u: jax.Array) -> jax.Array:
+def _springs(scene: em.Scene, support: em.supports.ElasticSupport, u: jax.Array) -> jax.Array:
     facets, area, N = _surface(scene, support.facet_set, None)
     size = jnp.linalg.norm(area, axis=-1, keepdims=True)
     at = jnp.einsum("qa,kai->kqi", N, jnp.asarray(u)[facets])
@@ -254,12 +253,12 @@ def _springs(scene: Scene, support: ElasticSupport, u: jax.Array) -> jax.Array:
     return _collect(scene, facets, local)
 
 
-def _collect(scene: Scene, nodes: np.ndarray, local: jax.Array) -> jax.Array:
+def _collect(scene: em.Scene, nodes: np.ndarray, local: jax.Array) -> jax.Array:
     return jnp.zeros((len(scene.mesh.nodes), 3)).at[nodes].add(local)
 
 
 # ---- judgements --------------------------------------------------------------------------------
-def residual(scene: Scene, u: jax.Array, theta: jax.Array) -> tuple[float, bool]:
+def residual(scene: em.Scene, u: jax.Array, theta: jax.Array) -> tuple[float, bool]:
     """Residual over the free components, relative to the forces at work.
 
     Also whether it was computed without the package's energy.
@@ -269,12 +268,12 @@ def residual(scene: Scene, u: jax.Array, theta: jax.Array) -> tuple[float, bool]
         internal, external = internal_force(scene, u, theta), external_force(scene, u, theta)
         return relative(scene, internal, external), True
     except UnknownError:
-        internal = jax.grad(strain_energy(scene))(u, theta)
-        out_of_balance = jax.grad(potential_energy(scene))(u, theta)
+        internal = jax.grad(em.fem.strain_energy(scene))(u, theta)
+        out_of_balance = jax.grad(em.fem.potential_energy(scene))(u, theta)
         return relative(scene, internal, internal - out_of_balance), False
 
 
-def relative(scene: Scene, internal: jax.Array, external: jax.Array) -> float:
+def relative(scene: em.Scene, internal: jax.Array, external: jax.Array) -> float:
     """Norm of the free part of the difference over the sum of the norms."""
     # Divided by their largest first: the squares of forces of 1e200 mN overflow.
     top = max(float(jnp.max(jnp.abs(internal))), float(jnp.max(jnp.abs(external))), 1e-300)
@@ -284,7 +283,7 @@ def relative(scene: Scene, internal: jax.Array, external: jax.Array) -> float:
     return float(jnp.linalg.norm(free) / jnp.where(scale > 0.0, scale, 1.0))
 
 
-def is_round_off(scene: Scene, u: jax.Array, theta: jax.Array) -> bool:
+def is_round_off(scene: em.Scene, u: jax.Array, theta: jax.Array) -> bool:
     """Whether the displacement that the residual stands for, by this file's tangent, is nothing."""
     free = np.flatnonzero(~scene.held.ravel())
     if len(free) > MOST_UNKNOWNS:
@@ -306,13 +305,13 @@ def is_round_off(scene: Scene, u: jax.Array, theta: jax.Array) -> bool:
     return bool(correction <= max(TOLERANCE * np.abs(u).max(), SMALLEST * extent))
 
 
-def smallest_volume_ratio(scene: Scene, u: jax.Array) -> float:
+def smallest_volume_ratio(scene: em.Scene, u: jax.Array) -> float:
     """Least ``J`` at a quadrature point."""
     F, _, _ = deformation(scene)
     return float(jnp.min(jax.vmap(jax.vmap(det))(F(jnp.asarray(u)[scene.mesh.elements]))))
 
 
-def judge(scene: Scene, u: jax.Array, theta: jax.Array, claim: str | None = None) -> Judgement:
+def judge(scene: em.Scene, u: jax.Array, theta: jax.Array, claim: str | None = None) -> Judgement:
     """Judge an answer that converged; ``claim`` says what the case itself found wrong."""
     if not bool(jnp.all(jnp.isfinite(u))):
         return Judgement(float("nan"), False, float("nan"), "displacement not finite")
@@ -335,7 +334,7 @@ def judge(scene: Scene, u: jax.Array, theta: jax.Array, claim: str | None = None
     return Judgement(error, independent, least, "; ".join(wrong))
 
 
-def is_stable(simulator: Simulator, u: jax.Array, theta: jax.Array) -> bool | None:
+def is_stable(simulator: em.Simulator, u: jax.Array, theta: jax.Array) -> bool | None:
     """Whether the tangent is positive definite; ``None`` where loads have no potential."""
     system = simulator.system
     if system.forces:

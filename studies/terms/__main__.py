@@ -13,17 +13,14 @@ from typing import Any
 
 import jax
 import numpy as np
+from studies.common.figures import BLUE, VERMILION, pyplot
 from studies.common.output import Case, Results, parser, save
 
 import calibrate as cal
 import emulator as em
-from calibrate.analysis.terms import find_terms
-from calibrate.figures import BLUE, VERMILION, pyplot
-from emulator.mechanics.laws.invariant_terms import TERMS
-from emulator.specimens.specimen import specimen
-from emulator.specimens.states import states
 
 HERE = Path(__file__).parent
+TERMS = em.find_law("invariant_terms").parameters[:-1]  # the last one is kappa
 SEED = 11
 TWINS, POINTS = 20, 8
 LEAST_SHARE = 0.3  # of a term's part of the stresses, of the largest part
@@ -47,8 +44,8 @@ def model_of(shears: bool) -> cal.Model:
     columns = {
         name: np.concatenate([test[k] for test in tests.values()]) for k, name in enumerate(names)
     }
-    scene = specimen(
-        states(columns, [name for name in tests for _ in range(POINTS)]),
+    scene = em.specimen(
+        em.specimens.states(columns, [name for name in tests for _ in range(POINTS)]),
         law=em.find_law("invariant_terms"), constants={"kappa": 1000.0},
         parameters=tuple(em.Parameter(name, "kPa", 0.0, 50.0) for name in TERMS),
         fibres=[1.0, 0.0, 0.0], sheets=[0.0, 1.0, 0.0],
@@ -73,7 +70,7 @@ def examine(model: cal.Model, number: int, error: float) -> Case:
     moduli[chosen] = 5.0 * shares / np.where(sizes > 0.0, sizes, np.inf)[chosen]
     clean = np.asarray(exact(moduli))
     noise = error * np.sqrt(np.mean(clean**2)) * rng.normal(size=clean.shape)
-    found = find_terms(model, clean + noise, held_out=False)
+    found = cal.analysis.find_terms(model, clean + noise, held_out=False)
     seen = [TERMS[k] for k in chosen if moduli[k] > 0.0]
     return {
         "true": seen,

@@ -21,24 +21,17 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from studies.common.figures import COLOURS, pyplot
 from studies.common.output import Case, Results, parser, save
 from studies.common.two_meshes import on_mesh, on_two_meshes
 
 import calibrate as cal
 import emulator as em
-from calibrate.figures import COLOURS, pyplot
-from calibrate.measurements import CavityVolume, Observations, landmarks, spread_landmarks
-from calibrate.samplers import NUTSOptions
-from emulator.fem import Simulator, run_campaign
-from emulator.mechanics.laws import find_law
-from emulator.scenes import Parameter, Scene
-from emulator.scenes.built_in.ventricles import HELIX, PRESSURE
-from emulator.scenes.fibre_rules import Helix
 
 HERE = Path(__file__).parent
 SEED = 17
 LEVEL = 0.9
-OPTIONS = NUTSOptions(warmup=200, draws=250, chains=2, rounds=4, r_hat=1.03, ess=100.0)
+OPTIONS = cal.samplers.NUTSOptions(warmup=200, draws=250, chains=2, rounds=4, r_hat=1.03, ess=100.0)
 CERTIFIED = 2  # posteriors of a case, where it asks for them
 PRESSURES = (0.6, 0.9, 1.2)  # kPa, known, of several states
 
@@ -100,27 +93,29 @@ FREE_SETS = {"ventricle": 60}  # data sets of whose pressure nothing is known
 QUICK = {"beam": replace(STUDIES["beam"], sets=10)}
 
 
-def of_default(changes: Callable[[Scene], Scene]) -> Callable[[], Scene]:
+def of_default(changes: Callable[[em.Scene], em.Scene]) -> Callable[[], em.Scene]:
     """The default ventricle, changed."""
     return lambda: changes(em.scenes.left_ventricle())
 
 
-def of_another_law(scene: Scene) -> Scene:
+def of_another_law(scene: em.Scene) -> em.Scene:
     """Guccione's law, of about the same stiffness; it shares the pressure alone."""
     ranges = {"C": ("kPa", 0.3, 0.8), "b_f": ("", 10.0, 20.0), "b_t": ("", 3.0, 7.0),
               "b_fs": ("", 3.0, 7.0)}  # fmt: skip
-    own = tuple(Parameter(name, *ends, "log") for name, ends in ranges.items())
-    return replace(scene, law=find_law("guccione"), parameters=(*own, PRESSURE), origin={})
+    own = tuple(em.Parameter(name, *ends, "log") for name, ends in ranges.items())
+    return replace(
+        scene, law=em.find_law("guccione"), parameters=(*own, scene.parameters[-1]), origin={}
+    )
 
 
-def of_other_fibres(scene: Scene) -> Scene:
+def of_other_fibres(scene: em.Scene) -> em.Scene:
     """Fibres turned by 15 degrees throughout: 75 to -45 in place of 60 to -60."""
-    fibres, _ = Helix((HELIX[0] + 15.0, HELIX[1] + 15.0)).directions(scene.mesh)
+    fibres, _ = em.scenes.Helix((75.0, -45.0)).directions(scene.mesh)
     return replace(scene, fibres=fibres, origin={})
 
 
 # Three and a half to five times the nodes of the finest mesh that a model of the body knows.
-TRUTHS: dict[str, Callable[[], Scene]] = {
+TRUTHS: dict[str, Callable[[], em.Scene]] = {
     "beam": lambda: em.scenes.once_clamped_beam((60, 6, 6)),
     "liver": lambda: em.scenes.liver(10),
     # A ligament that the coarse and the fine mesh cover exactly.
@@ -150,7 +145,7 @@ def emulator_of(body: str) -> em.Emulator:
 
 
 @lru_cache(maxsize=2)
-def fields_of(truth: str, states: bool, sets: int) -> tuple[Scene, Any, Any]:
+def fields_of(truth: str, states: bool, sets: int) -> tuple[em.Scene, Any, Any]:
     """The true scene, theta (sets, S, p) and displacement (sets, S, n, 3).
 
     With ``states``, one for each known pressure.
@@ -162,7 +157,7 @@ def fields_of(truth: str, states: bool, sets: int) -> tuple[Scene, Any, Any]:
     if states:
         thetas[:, :, scene.parameter_names.index("pressure")] = PRESSURES
     flat = jnp.asarray(thetas.reshape(-1, thetas.shape[-1]))
-    found = run_campaign(Simulator(scene), flat, progress=True).displacement
+    found = em.fem.run_campaign(em.Simulator(scene), flat, progress=True).displacement
     return scene, thetas, np.asarray(found).reshape(*thetas.shape[:2], *found.shape[1:])
 
 
@@ -171,15 +166,15 @@ def names_of(study: Study) -> list[str]:
     return [f"@{k + 1}" for k in range(study.states)] or [""]
 
 
-def observed(study: Study, scene: Scene, at: np.ndarray) -> Observations:
+def observed(study: Study, scene: em.Scene, at: np.ndarray) -> cal.Observations:
     """What is measured on ``scene``, in every load state."""
     parts: dict[str, Any] = {}
     for state in names_of(study):
         if study.landmarks:
-            parts[f"displacement{state}"] = landmarks(scene, at)
+            parts[f"displacement{state}"] = cal.landmarks(scene, at)
         if study.volume is not None:
-            parts[f"volume{state}"] = CavityVolume(scene)
-    return Observations(parts)
+            parts[f"volume{state}"] = cal.CavityVolume(scene)
+    return cal.Observations(parts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,8 +187,8 @@ class Setting:
     name: str
     study: Study
     model: cal.Model
-    scene: Scene
-    true: Observations
+    scene: em.Scene
+    true: cal.Observations
     thetas: Any
     fields: Any
 
@@ -214,7 +209,7 @@ class Setting:
             for n, v in exact.items()
         }
 
-    def posterior(self, r: int, options: NUTSOptions) -> cal.Posterior:
+    def posterior(self, r: int, options: cal.samplers.NUTSOptions) -> cal.Posterior:
         """Draws given data set ``r``, by NUTS."""
         return cal.sample(self.model, self.data(r), options=options, seed=r, predictions=False)
 
@@ -222,7 +217,7 @@ class Setting:
 def setting_of(name: str, study: Study) -> Setting:
     """The model and the true fields of one kind of data."""
     emulator = emulator_of(study.body)
-    at = spread_landmarks(emulator.scene, max(study.landmarks, 1), SEED)
+    at = cal.spread_landmarks(emulator.scene, max(study.landmarks, 1), SEED)
     observe = observed(study, emulator.scene, at)
     sd = {"displacement": study.noise, "volume": study.volume}
     noise = {name: cal.GaussianNoise(sd[name.split("@")[0]]) for name in observe.parts}
@@ -253,9 +248,9 @@ def certified(setting: Setting, furthest: list[float]) -> list[cal.Certificate]:
     study = setting.study
     order = np.argsort(furthest)[::-1] if study.certify == "worst" else np.arange(study.sets)
     chosen = [int(r) for r in order[:CERTIFIED]] if study.certify else []
-    simulator = Simulator(setting.model.forward.scene)
+    simulator = em.Simulator(setting.model.forward.scene)
     return [
-        cal.certify(setting.posterior(r, NUTSOptions()), simulator, draws=100, seed=r)
+        cal.certify(setting.posterior(r, cal.samplers.NUTSOptions()), simulator, draws=100, seed=r)
         for r in chosen
     ]
 

@@ -19,7 +19,7 @@ from emulator.scenes.scene import Scene
 _INSIDE, _OUTSIDE, _BAND = BLUE, VERMILION, "0.85"  # blue and vermilion differ for all readers
 
 
-def draw_calibration(calibration: Calibration, title: str, path: str | Path) -> None:
+def calibration_figure(calibration: Calibration, title: str, path: str | Path) -> None:
     """Draw the difference of each quantity's distribution of ranks to the uniform one, and a band.
 
     A hump above zero: truths lie low among the draws. Steep ends, flat middle: the posterior is too

@@ -47,7 +47,7 @@ class Systematic:
 
     names : names of its s unknowns, each a standard normal.
     modes : the change of each observation's data for one standard deviation of each unknown,
-        (s, *shape), by the observation's name.
+        ``(s, *shape)``, by the observation's name.
     size : the name of an inferred size of the error and the scale of its half-normal prior, or
         None; modes are then those of size 1. Errors with one name have one size.
     shares : the modes that are shares of the predicted data, in the shape of ``modes``; the change

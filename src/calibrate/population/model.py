@@ -21,9 +21,9 @@ that of correlated normals, cut,
     a_k = \frac{l_k - m_k}{s_k}, \; b_k = \frac{h_k - m_k}{s_k},
 
 and where the population is far from both ends, :math:`x_i = m + \text{diag}(s) L z_i`. This is the
-form of :class:`calibrate.Population` (log-normals cut to the range, normal scores correlated), so
-that :math:`e^m` is the median, :math:`s` about the relative sd. The own unknowns of a member, which
-are all others, keep the prior of its model.
+form of :class:`calibrate.priors.Population` (log-normals cut to the range, normal scores
+correlated), so that :math:`e^m` is the median, :math:`s` about the relative sd. The own unknowns of
+a member, which are all others, keep the prior of its model.
 
 A value x of a normal of mean m and sd s, cut to (l, h), has the normal score q,
 

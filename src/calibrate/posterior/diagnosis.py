@@ -30,7 +30,7 @@ from calibrate.arviz import base, stats
 from calibrate.importance.weights import LARGEST_PARETO_SHAPE
 from calibrate.posterior.box import BoxEnd, in_words
 from calibrate.samplers import diagnostics as limits
-from calibrate.samplers import r_hat
+from calibrate.samplers.diagnostics import r_hat
 from calibrate.samplers.importance import SEEN_ONCE
 from calibrate.samplers.modes import MISSED_AT, MISSED_BY
 from emulator.surrogates.corrected import CORRECTED

@@ -32,12 +32,12 @@ from calibrate.posterior.diagnosis import (
 from calibrate.posterior.reliance import Reliance, reliance_of, rests_on_prior
 from calibrate.posterior.taken_up import TakenUp, sentences, taken_up
 from calibrate.provenance import as_attributes, versions
-from calibrate.samplers import check_options, density_of, find_sampler, named_draws
+from calibrate.samplers import check_options, density_of, find_sampler
 from calibrate.samplers.modes import MISSED_BY, MOST, MOST_BY_FEM, explore, missed_mode
 from calibrate.samplers.protocol import Context
 from calibrate.state_names import split
 from calibrate.statistical_model import Data, Model
-from calibrate.statistical_model.density import prior_draws
+from calibrate.statistical_model.density import named_draws, prior_draws
 from emulator.core.checkpoint import Checkpoint, identity_of
 from emulator.core.display import TableRepr
 from emulator.core.errors import InputError, check_known

@@ -68,7 +68,7 @@ def infer(
     if not isinstance(run, Run | Problem):
         raise InputError(
             f"infer: {type(run).__name__} is not one run; calibrate infer FILE takes members of a "
-            "population, and calibrate.hierarchy their models"
+            "population, and calibrate.population.hierarchy their models"
         )
     target, stages = None if folder is None else Path(folder), Stages(show=progress)
     checkpoint, solutions = (target and target / name for name in (SAMPLING, SOLUTIONS))

@@ -2,7 +2,7 @@
 
 The folder of a population has ``members/NAME``, the folder of a run, for each member
 (:mod:`calibrate.project.results`); ``run.json``, the :class:`Members`; and ``posterior.nc``, the
-hierarchy of them all (:func:`calibrate.read_hierarchy`).
+hierarchy of them all (:func:`calibrate.population.read_hierarchy`).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _SAME_MODEL = (
 
 @dataclass(frozen=True)
 class Shared:
-    """The settings that all members of a population share, as in :func:`calibrate.hierarchy`.
+    """The settings that all members of a :func:`calibrate.population.hierarchy` share.
 
     shared : unknowns that follow the population; by default all that every member has.
     median : median and relative sd of a log-normal prior of the population's median, by name.

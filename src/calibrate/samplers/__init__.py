@@ -8,13 +8,12 @@ from typing import Any
 
 from calibrate.samplers.auto import AUTO, AutoOptions
 from calibrate.samplers.chains import ChainSampler
-from calibrate.samplers.diagnostics import r_hat
 from calibrate.samplers.importance import IMPORTANCE, ImportanceOptions
 from calibrate.samplers.laplace import LAPLACE, LaplaceOptions
 from calibrate.samplers.nuts import BLACKJAX_NUTS, NUTS, BlackJAXNUTSOptions, NUTSOptions
-from calibrate.samplers.protocol import ChainOptions, Context, Draws, Kernel, Sampler
+from calibrate.samplers.protocol import ChainOptions, Kernel, Sampler
 from calibrate.samplers.smc import SMC, SMCOptions
-from calibrate.statistical_model.density import Density, density_of, named_draws
+from calibrate.statistical_model.density import Density, density_of
 from emulator.core.errors import InputError, look_up
 from emulator.core.machine import memory
 from emulator.core.schema import Source, parse, table_of
@@ -28,21 +27,13 @@ __all__ = [
     "BlackJAXNUTSOptions",
     "ChainOptions",
     "ChainSampler",
-    "Context",
     "Density",
-    "Draws",
     "ImportanceOptions",
     "Kernel",
     "LaplaceOptions",
     "NUTSOptions",
     "SMCOptions",
-    "Sampler",
-    "check_options",
     "density_of",
-    "find_sampler",
-    "named_draws",
-    "options_from",
-    "r_hat",
 ]
 
 

@@ -1,9 +1,9 @@
 """The No-U-Turn sampler (Hoffman and Gelman 2014), dense metric: NumPyro's and BlackJAX's.
 
 Which of the two is faster depends on the posterior: BlackJAX's on landmarks and strains, NumPyro's
-on a volume (studies/decoder_speed). NumPyro's kernel adapts step size and metric in its first steps
-and is compiled once a model, where its ``MCMC`` class compiles for every run. BlackJAX's runs
-Stan's window adaptation in ``init``.
+on a volume (docs/experiments.md, "Effective draws by what is observed"). NumPyro's kernel adapts
+step size and metric in its first steps and is compiled once a model, where its ``MCMC`` class
+compiles for every run. BlackJAX's runs Stan's window adaptation in ``init``.
 """
 
 from __future__ import annotations

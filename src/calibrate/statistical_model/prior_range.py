@@ -53,7 +53,7 @@ def fit_to(forward: ForwardMap, prior: Prior) -> tuple[Prior, dict[str, float]]:
                 f"prior of '{name}' has {share} of its mass outside "
                 f"{parameter.low:g} to {parameter.high:g} {parameter.unit}".rstrip()
                 + f", where forward map '{forward.kind}' has no answer: cut it yourself with "
-                "cal.truncated(prior, scene), or use FEM or a scene of wider range"
+                "cal.priors.truncated(prior, scene), or use FEM or a scene of wider range"
             )
         cut[name] = mass
     inside = truncated(prior, forward.scene)

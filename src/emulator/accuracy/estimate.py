@@ -36,7 +36,7 @@ of the error.
 
 The tangent at the prediction costs a factorisation. The tangent at the centre of the box, as
 preconditioner of a few conjugate gradients, is cheaper and too inaccurate for a bending beam
-(docs/experiments.md, "An error bar from the forces out of balance"; ``studies/error_bar``).
+(docs/experiments.md, "An error bar from the forces out of balance").
 
 Inside ``jit`` a :class:`Guard` is flags and numbers; outside, :meth:`Guard.sentence` puts them in
 words.

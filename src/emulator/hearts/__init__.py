@@ -5,4 +5,10 @@ even. :mod:`.heart` makes the walls of a left ventricle or of both, from :mod:`.
 surfaces, :mod:`.wall`, which fills and measures what is between them, and :mod:`.checks`.
 :mod:`.left_wall` cuts the left ventricle's part from both, and :mod:`.sheet` makes a body from
 outlines in a plane.
+
+What it exports is listed in ``__init__.pyi`` and imported when first used.
 """
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

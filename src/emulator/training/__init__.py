@@ -1,6 +1,8 @@
-"""Training of emulators."""
+"""Training of emulators.
 
-from emulator.training.plan import Plan
-from emulator.training.trainer import RECIPES, recipe, remove_checkpoint, train
+What it exports is listed in ``__init__.pyi`` and imported when first used.
+"""
 
-__all__ = ["RECIPES", "Plan", "recipe", "remove_checkpoint", "train"]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

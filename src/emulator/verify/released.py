@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.errors import InputError
-from emulator.fem import NewtonOptions, Simulator, run_campaign, solve_together
+from emulator.fem import NewtonOptions, Simulator, run_campaign
+from emulator.fem.campaign import solve_together
 from emulator.fem.campaign.designs import Reference
 from emulator.fem.energy import potential_energy
 from emulator.released.scenes import MODELS, models_in, published_scene, published_tests, units

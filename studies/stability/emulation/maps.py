@@ -10,9 +10,6 @@ import numpy as np
 from studies.stability.emulation.check import Ended, add
 
 import emulator as em
-from emulator.accuracy.estimate import ErrorBar
-from emulator.fem import Simulator
-from emulator.surrogates.emulator import Emulator
 
 NAMES = ("once_clamped_beam", "twisting_cube", "liver", "left_ventricle")
 SHIPPED = (*NAMES, *(f"{name}_series" for name in NAMES))
@@ -22,7 +19,7 @@ ROUND_OFF = 1e-3  # of the largest displacement, in float32
 
 
 @cache
-def shipped(name: str) -> Emulator:
+def shipped(name: str) -> em.Emulator:
     return em.load(name)
 
 
@@ -52,8 +49,8 @@ def _in_float32(name: str) -> Ended:
 def _outside(name: str, out: float) -> Ended:
     """Outside, a map says so, and the error bar is right or is not trusted."""
     forward, scene = shipped(name).cache(), shipped(name).scene
-    simulator, ratios, failed = Simulator(scene), [], 0
-    bar = ErrorBar(forward, simulator)
+    simulator, ratios, failed = em.Simulator(scene), [], 0
+    bar = em.ErrorBar(forward, simulator)
     for x in positions(len(scene.parameters), out):
         theta = scene.from_unit(jnp.asarray(x))
         if bool(forward.evaluate(theta).valid):

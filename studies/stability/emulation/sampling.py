@@ -18,10 +18,6 @@ from studies.stability.emulation.check import Ended, add
 
 import calibrate as cal
 import emulator as em
-from calibrate.samplers import find_sampler
-from emulator.scenes import Scene
-from emulator.scenes.scene import all_nodes
-from emulator.surrogates.protocol import Prediction, fingerprint_of
 
 SAMPLERS = ("nuts", "blackjax_nuts", "smc", "laplace")
 SHIFT, LOG_SD = 0.25, np.log(1.25)  # of moments, in posterior sd
@@ -58,7 +54,7 @@ TARGETS = {
 
 
 @cache
-def scene() -> Scene:
+def scene() -> em.Scene:
     return em.scenes.once_clamped_beam((2, 1, 1), order=1)
 
 
@@ -71,21 +67,21 @@ class Toy:
     kind = label = "toy"
 
     @property
-    def scene(self) -> Scene:
+    def scene(self) -> em.Scene:
         return scene()
 
     @property
     def fingerprint(self) -> str:
-        return fingerprint_of(self.kind, self.name, self.nodes)
+        return f"{self.kind} {self.name} {hash(self.nodes.tobytes())}"
 
     def __call__(self, theta: jax.Array) -> jax.Array:
         moved = TARGETS[self.name].g(scene().to_unit(theta))
         return jnp.zeros((len(self.nodes), 3)).at[:, 2].set(moved)
 
-    def evaluate(self, theta: jax.Array) -> Prediction:
+    def evaluate(self, theta: jax.Array) -> em.Prediction:
         x = scene().to_unit(theta)
         inside = jnp.all((x >= 0.0) & (x <= 1.0))
-        return Prediction(self(theta), inside & TARGETS[self.name].valid(x))
+        return em.Prediction(self(theta), inside & TARGETS[self.name].valid(x))
 
     def at(self, nodes: np.ndarray) -> Toy:
         return replace(self, nodes=np.asarray(nodes))
@@ -114,12 +110,12 @@ def exact(target: Target) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _sampled(name: str, sampler: str) -> Ended:
-    target, forward = TARGETS[name], Toy(name, all_nodes(scene()))
+    target, forward = TARGETS[name], Toy(name, np.arange(scene().node_count))
     tip = int(np.argmax(scene().mesh.nodes[:, 0]))
     observe = cal.nodal_displacements(scene(), np.array([tip]))
     model = cal.model(forward, observe, cal.GaussianNoise(target.sd), check_scale=False)
     data = np.array([[0.0, 0.0, target.datum]])
-    options = find_sampler(sampler).options()
+    options = cal.samplers.SAMPLERS[sampler].options()
     posterior = cal.sample(model, data, sampler=sampler, options=options, seed=5)
     told = posterior.warnings()
     if target.told:

@@ -1,4 +1,4 @@
-"""Training on the energy from zero: rates, batches, exponents, with and without barriers.
+"""Training on the energy from zero: rates, batches, exponents.
 
 A network that is poor is no wrong answer; one that is poor while its error bar says otherwise is.
 """
@@ -6,8 +6,6 @@ A network that is poor is no wrong answer; one that is poor while its error bar 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache, partial
 
@@ -15,11 +13,6 @@ import numpy as np
 from studies.stability.emulation.check import Ended, add
 
 import emulator as em
-from emulator.accuracy.estimate import ErrorBar
-from emulator.fem import Simulator, sobol
-from emulator.scenes import Scene
-from emulator.surrogates.emulator import Emulator
-from emulator.training import paper, recipe, train
 
 FAMILY = "training"
 STEPS, TESTS = 60, 4
@@ -27,7 +20,7 @@ FACTOR = 3.0  # an error bar is right within it
 
 
 @cache
-def ventricle(exponent: float) -> Scene:
+def ventricle(exponent: float) -> em.Scene:
     """A coarse ventricle, its exponents ``b`` and ``b_f`` times ``exponent``."""
     scene = em.scenes.left_ventricle(4, 8, 1, order=1)
     grown = {"b", "b_f"}
@@ -38,37 +31,21 @@ def ventricle(exponent: float) -> Scene:
     return replace(scene, parameters=stiffer, origin={} if exponent != 1.0 else scene.origin)
 
 
-@contextmanager
-def _without_barriers() -> Iterator[None]:
-    """The exact energy in training, as if Eq. 21 to 23 were not there."""
-    kept = paper.Barriers
-    paper.Barriers = lambda: None  # type: ignore[assignment]
-    try:
-        yield
-    finally:
-        paper.Barriers = kept
-
-
-def _trained(rate: float, batch: int, exponent: float, barriers: bool, name: str) -> Ended:
-    plan = replace(recipe(name), learning_rate=rate, batch=batch, steps=STEPS)
+def _trained(rate: float, batch: int, exponent: float, name: str) -> Ended:
+    plan = replace(em.recipe(name), learning_rate=rate, batch=batch, steps=STEPS)
     with tempfile.TemporaryDirectory() as folder:
-        if barriers:
-            found = train(ventricle(exponent), plan, folder)
-        else:
-            with _without_barriers():
-                found = train(ventricle(exponent), plan, folder)
-    return judge(found)
+        return judge(em.train(ventricle(exponent), plan, folder))
 
 
-def judge(found: Emulator) -> Ended:
+def judge(found: em.Emulator) -> Ended:
     """Predictions are finite, and the error bar knows how poor they are."""
     scene, forward = found.scene, found.cache()
-    simulator = Simulator(scene)
-    thetas = sobol(scene, TESTS, 11)
+    simulator = em.Simulator(scene)
+    thetas = em.fem.sobol(scene, TESTS, 11)
     predicted = np.stack([np.asarray(forward(theta)) for theta in thetas])
     if not np.isfinite(predicted).all():
         return Ended("TRAINED", "the trained emulator's displacement is not finite")
-    bar, ratios, flagged = ErrorBar(forward, simulator), [], 0
+    bar, ratios, flagged = em.ErrorBar(forward, simulator), [], 0
     for theta, u in zip(thetas, predicted, strict=True):
         exact = np.asarray(simulator.solve(theta).require_converged().displacement)
         true = float(np.median(np.linalg.norm(u - exact, axis=1)))
@@ -83,7 +60,7 @@ def judge(found: Emulator) -> Ended:
     return Ended("TRAINED", note=f"{note}, {flagged} of {TESTS} not trusted")
 
 
-_DEFAULT = {"rate": 1e-3, "batch": 1, "exponent": 1.0, "barriers": True, "name": "paper"}
+_DEFAULT = {"rate": 1e-3, "batch": 1, "exponent": 1.0, "name": "paper"}
 for _name, _other in {
     "rate_1e_6": {"rate": 1e-6},
     "rate_1e_3": {},
@@ -92,9 +69,6 @@ for _name, _other in {
     "batch_64": {"batch": 64},
     "exponents_threefold": {"exponent": 3.0},
     "exponents_tenfold": {"exponent": 10.0},
-    "without_barriers": {"barriers": False},
-    "without_barriers_rate_1": {"barriers": False, "rate": 1.0},
-    "without_barriers_exponents_tenfold": {"barriers": False, "exponent": 10.0},
 }.items():
     add(FAMILY, f"training_{_name}", partial(_trained, **(_DEFAULT | _other)))
 add(FAMILY, "training_rate_NaN", partial(_trained, **(_DEFAULT | {"rate": float("nan")})))

@@ -9,13 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from studies.stability.solver.case import CASES, SEED, Case
 
-from emulator import Scene
-from emulator.scenes import BUILT_IN
+import emulator as em
 
 
 @cache
-def built_in(name: str) -> Scene:
-    return BUILT_IN[name]()
+def built_in(name: str) -> em.Scene:
+    return em.scenes.BUILT_IN[name]()
 
 
 def corners(count: int) -> list[tuple[int, ...]]:
@@ -34,8 +33,8 @@ def _corner(name: str, corner: tuple[int, ...], stretch: float) -> Case:
     return Case(scene, np.asarray(scene.from_unit(jnp.asarray(position))))
 
 
-for _name in BUILT_IN:
-    for _bits in corners(len(BUILT_IN[_name](order=1).parameters)):
+for _name in em.scenes.BUILT_IN:
+    for _bits in corners(len(em.scenes.BUILT_IN[_name](order=1).parameters)):
         _label = f"{_name}_" + "".join("lh"[bit] for bit in _bits)
         CASES[_label] = ("corners of the boxes", partial(_corner, _name, _bits, 1.0))
         CASES[_label + "_outside"] = (

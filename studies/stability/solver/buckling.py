@@ -8,8 +8,7 @@ import numpy as np
 from studies.stability.solver.bodies import DOWN, bar, moduli, moved
 from studies.stability.solver.case import Case, case
 
-from emulator import Support
-from emulator.scenes.loads import Traction
+import emulator as em
 
 
 def _column(shortening: float, tilt: float = 0.0) -> Case:
@@ -55,7 +54,7 @@ def _loaded_column(factor: float, side: float) -> Case:
     mu = lam = 5.0
     E = mu * (3 * lam + 2 * mu) / (lam + mu)
     critical = np.pi**2 * E * 5.0**2 / 12.0 / 4.0 / 100.0**2  # kPa
-    load = Traction("right", (-factor * critical, 0.0, side * critical))
+    load = em.loads.Traction("right", (-factor * critical, 0.0, side * critical))
     return Case(bar((100.0, 5.0, 5.0), (30, 2, 2), loads=(load,)), moduli(mu, lam))
 
 
@@ -99,7 +98,7 @@ def arch_snaps_through() -> Case:
     scene = replace(
         scene,
         mesh=replace(scene.mesh, nodes=nodes),
-        supports=(Support("left"), Support("right")),
-        loads=(Traction("top", (0.0, 0.0, -0.02)),),
+        supports=(em.Support("left"), em.Support("right")),
+        loads=(em.loads.Traction("top", (0.0, 0.0, -0.02)),),
     )
     return Case(scene, moduli())

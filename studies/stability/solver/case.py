@@ -12,10 +12,10 @@ import jax
 import numpy as np
 from studies.stability.judge import is_stable, judge
 
-from emulator import NewtonOptions, Scene, Simulator, Status
+import emulator as em
 
 SEED = 7
-SINGLE_STEP = NewtonOptions(min_increment=1.0)
+SINGLE_STEP = em.fem.NewtonOptions(min_increment=1.0)
 
 
 @dataclass(frozen=True)
@@ -29,10 +29,10 @@ class Case:
     claim : what must hold for a converged answer; returns what is wrong, or an empty string.
     """
 
-    scene: Scene
+    scene: em.Scene
     theta: Any
     start: Any = None
-    options: NewtonOptions = field(default_factory=NewtonOptions)
+    options: em.fem.NewtonOptions = field(default_factory=em.fem.NewtonOptions)
     inside_jit: bool = False
     claim: Callable[[np.ndarray], str] = lambda _: ""
 
@@ -42,7 +42,7 @@ class Case:
         simulator, solution = _solve(self)
         return {
             "time_s": time.perf_counter() - began,
-            "status": Status(int(solution.status)).name,
+            "status": em.fem.Status(int(solution.status)).name,
             "iterations": int(solution.iterations),
             "load_reached": float(solution.load_reached),
             **_verdict(self, simulator, solution),
@@ -71,11 +71,11 @@ def near(what: str, value: float, wanted: float, tolerance: float) -> str:
 
 
 @cache  # cases share scenes, and each is compiled once
-def simulator_of(scene: Scene, options: NewtonOptions) -> Simulator:
-    return Simulator(scene, options)
+def simulator_of(scene: em.Scene, options: em.fem.NewtonOptions) -> em.Simulator:
+    return em.Simulator(scene, options)
 
 
-def _solve(found: Case) -> tuple[Simulator, Any]:
+def _solve(found: Case) -> tuple[em.Simulator, Any]:
     """The simulator's answer, computed when this returns."""
     simulator = simulator_of(found.scene, found.options)
     call = jax.jit(simulator.solve) if found.inside_jit else simulator.solve
@@ -83,12 +83,12 @@ def _solve(found: Case) -> tuple[Simulator, Any]:
     return simulator, jax.block_until_ready(solution)
 
 
-def _verdict(found: Case, simulator: Simulator, solution: Any) -> dict[str, Any]:
+def _verdict(found: Case, simulator: em.Simulator, solution: Any) -> dict[str, Any]:
     """Judge an answer by what its status claims."""
     u = np.asarray(solution.displacement)
     if not np.isfinite(u).all():
         return {"silent_wrong": True, "note": "displacement not finite"}
-    if solution.status != Status.CONVERGED:
+    if solution.status != em.fem.Status.CONVERGED:
         return {}
     claim = found.claim(u)
     try:

@@ -8,17 +8,16 @@ import numpy as np
 from studies.stability.solver.bodies import CLAMPED, DOWN, along_x, exponents
 from studies.stability.solver.case import Case, case
 
-from emulator import Parameter, Scene, Support
-from emulator.geometry.generators.box import box
-from emulator.mechanics.laws import find_law
-from emulator.scenes.loads import Traction
+import emulator as em
 
 
-def pulled_fibres(law: str, stretch: float, constants: dict[str, float]) -> Scene:
-    mesh = box((10.0, 5.0, 5.0), (4, 2, 2))
-    parameters = (Parameter(*(("C", "kPa", 0.1, 10.0) if law == "guccione" else _A_BOX)),)
-    ends = (Support("left"), Support("right", np.array([10.0 * (stretch - 1.0), 0.0, 0.0])))
-    return Scene("fibres", mesh, find_law(law), parameters, (), ends, constants, along_x(mesh))
+def pulled_fibres(law: str, stretch: float, constants: dict[str, float]) -> em.Scene:
+    mesh = em.generators.box((10.0, 5.0, 5.0), (4, 2, 2))
+    parameters = (em.Parameter(*(("C", "kPa", 0.1, 10.0) if law == "guccione" else _A_BOX)),)
+    ends = (em.Support("left"), em.Support("right", np.array([10.0 * (stretch - 1.0), 0.0, 0.0])))
+    return em.Scene(
+        "fibres", mesh, em.find_law(law), parameters, (), ends, constants, along_x(mesh)
+    )
 
 
 _A_BOX = ("a", "kPa", 0.1, 10.0)
@@ -66,6 +65,6 @@ def guccione_load_at_the_end_of_the_exponent() -> Case:
     scene = replace(
         pulled_fibres("guccione", 1.0, exponents(20.0, 10.0, 10.0, 100.0)),
         supports=CLAMPED,
-        loads=(Traction("right", (1e12, 0.0, 0.0)),),
+        loads=(em.loads.Traction("right", (1e12, 0.0, 0.0)),),
     )
     return Case(scene, np.array([1.0]))

@@ -6,13 +6,13 @@ import numpy as np
 from studies.stability.solver.bodies import bar, moduli
 from studies.stability.solver.case import Case, case, near
 
-from emulator import Support
-from emulator.geometry.generators.sphere import sphere_octant
-from emulator.scenes.loads import FollowerPressure
+import emulator as em
 
 
 def _follower_plate(pressure: float) -> Case:
-    scene = bar((40.0, 20.0, 2.0), (16, 8, 2), loads=(FollowerPressure("bottom", pressure),))
+    scene = bar(
+        (40.0, 20.0, 2.0), (16, 8, 2), loads=(em.loads.FollowerPressure("bottom", pressure),)
+    )
     return Case(scene, moduli(50.0, 50.0))
 
 
@@ -33,9 +33,9 @@ def follower_plate_far_too_much() -> Case:
 
 def _sphere(pressure: float) -> Case:
     """Incompressible Neo-Hookean, A = 10 and B = 15 mm, mu = 10 kPa: it bursts at 4.935 kPa."""
-    mesh = sphere_octant(10.0, 15.0, (4, 2), order=2)
-    planes = tuple(Support(axis, components=axis) for axis in "xyz")
-    loads = (FollowerPressure("inner", pressure),)
+    mesh = em.generators.sphere_octant(10.0, 15.0, (4, 2), order=2)
+    planes = tuple(em.Support(axis, components=axis) for axis in "xyz")
+    loads = (em.loads.FollowerPressure("inner", pressure),)
     scene = bar(mesh=mesh, supports=planes, loads=loads, dilatation="mean")
 
     def stretch(u: np.ndarray) -> str:

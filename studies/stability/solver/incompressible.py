@@ -9,10 +9,7 @@ import numpy as np
 from studies.stability.solver.bodies import DOWN, bar
 from studies.stability.solver.case import CASES, Case, case
 
-from emulator import Scene, Support
-from emulator.geometry.generators.box import cooks_membrane
-from emulator.geometry.mesh import signed_volumes
-from emulator.scenes.loads import Traction
+import emulator as em
 
 
 def _incompressible(nu: float, order: int, dilatation: str) -> Case:
@@ -25,9 +22,9 @@ def _incompressible(nu: float, order: int, dilatation: str) -> Case:
     return Case(scene, np.array([15.0, nu]), claim=volume_kept)
 
 
-def solid_volume(scene: Scene, u: np.ndarray) -> float:
+def solid_volume(scene: em.Scene, u: np.ndarray) -> float:
     """Volume inside the faces of the corners, mm3; of quadratic elements, nearly."""
-    return float(signed_volumes(scene.mesh.nodes + u, scene.mesh.elements).sum())
+    return float(em.geometry.signed_volumes(scene.mesh.nodes + u, scene.mesh.elements).sum())
 
 
 for _nu, (_kind, _order, _dilatation) in itertools.product(
@@ -42,9 +39,9 @@ for _nu, (_kind, _order, _dilatation) in itertools.product(
 
 def _cook(nu: float, factor: float) -> Case:
     E = 422.5 * 2 * (1 + nu)
-    mesh = cooks_membrane((6, 6), thickness=4.0, order=2)
-    supports = (Support("left"), Support("all", components="z"))
-    loads = (Traction("right", (0.0, 62.5 * factor, 0.0)),)
+    mesh = em.generators.cooks_membrane((6, 6), thickness=4.0, order=2)
+    supports = (em.Support("left"), em.Support("all", components="z"))
+    loads = (em.loads.Traction("right", (0.0, 62.5 * factor, 0.0)),)
     scene = bar(
         mesh=mesh, engineering=True, supports=supports, loads=loads, dilatation="mean", order=1
     )

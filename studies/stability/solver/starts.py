@@ -8,23 +8,24 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from studies.stability.solver.bodies import DOWN, bar, moduli
+from studies.stability.solver.bodies import DOWN, bar, moduli, twist
 from studies.stability.solver.case import SEED, Case, case, simulator_of
 
-from emulator import NewtonOptions, Scene, Simulator
-from emulator.scenes.built_in.boxes import twist
-from emulator.scenes.loads import Gravity
+import emulator as em
 
 
 @cache
-def cantilever() -> Scene:
+def cantilever() -> em.Scene:
     return bar(loads=(DOWN,))
 
 
 @cache
 def cantilever_solution() -> np.ndarray:
     return np.asarray(
-        simulator_of(cantilever(), NewtonOptions()).solve(moduli()).require_converged().displacement
+        simulator_of(cantilever(), em.fem.NewtonOptions())
+        .solve(moduli())
+        .require_converged()
+        .displacement
     )
 
 
@@ -79,21 +80,21 @@ def start_nearly_flat() -> Case:
 
 @case("starts")
 def start_opposite_load() -> Case:
-    up = replace(cantilever(), loads=(Gravity(direction=(0.0, 0.0, 1.0)),))
-    return _started(Simulator(up).solve(moduli()).displacement)
+    up = replace(cantilever(), loads=(em.loads.Gravity(direction=(0.0, 0.0, 1.0)),))
+    return _started(em.Simulator(up).solve(moduli()).displacement)
 
 
 @case("starts")
 def start_opposite_corner() -> Case:
     return _started(
-        simulator_of(cantilever(), NewtonOptions()).solve(moduli(1.0, 1.0)).displacement
+        simulator_of(cantilever(), em.fem.NewtonOptions()).solve(moduli(1.0, 1.0)).displacement
     )
 
 
 @case("starts")
 def start_ten_times_the_load() -> Case:
-    heavy = replace(cantilever(), loads=(Gravity(10.0),))
-    return _started(Simulator(heavy).solve(moduli()).displacement)
+    heavy = replace(cantilever(), loads=(em.loads.Gravity(10.0),))
+    return _started(em.Simulator(heavy).solve(moduli()).displacement)
 
 
 @case("starts")

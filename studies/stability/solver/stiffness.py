@@ -8,12 +8,11 @@ import numpy as np
 from studies.stability.solver.bodies import DOWN, bar, moduli
 from studies.stability.solver.case import SINGLE_STEP, Case, case
 
-from emulator import Simulator
-from emulator.scenes.loads import Gravity
+import emulator as em
 
 
 def _scaled(modulus: float, density: float) -> Case:
-    load = Gravity(density=density, direction=(0.0, 0.0, -1.0))
+    load = em.loads.Gravity(density=density, direction=(0.0, 0.0, -1.0))
     return Case(bar(loads=(load,)), moduli(5.0 * modulus, 5.0 * modulus))
 
 
@@ -22,7 +21,7 @@ def _same_shape(modulus: float) -> Case:
 
     def claim(u: np.ndarray) -> str:
         usual = _scaled(1.0, 1.0)
-        wanted = np.asarray(Simulator(usual.scene).solve(usual.theta).displacement)
+        wanted = np.asarray(em.Simulator(usual.scene).solve(usual.theta).displacement)
         gap = np.abs(u - wanted).max() / np.abs(wanted).max()
         return "" if gap < 1e-6 else f"differs from the unscaled solution by {gap:.1e}"
 

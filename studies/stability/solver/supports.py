@@ -8,8 +8,7 @@ import numpy as np
 from studies.stability.solver.bodies import DOWN, bar, moduli, moved
 from studies.stability.solver.case import Case, case, near
 
-from emulator.scenes.loads import Traction
-from emulator.scenes.supports import ElasticSupport
+import emulator as em
 
 
 def _on_springs(stiffness: float, face: str = "top") -> Case:
@@ -17,7 +16,7 @@ def _on_springs(stiffness: float, face: str = "top") -> Case:
         (10.0, 10.0, 10.0),
         (3, 3, 3),
         loads=(DOWN,),
-        supports=(ElasticSupport(face, stiffness),),
+        supports=(em.supports.ElasticSupport(face, stiffness),),
     )
     weight = 9.81e-3 * 1000.0  # mN
 
@@ -87,9 +86,9 @@ def pushed_through_itself() -> Case:
 
 @case("supports")
 def traction_a_thousand_moduli() -> Case:
-    return Case(bar(loads=(Traction("right", (5000.0, 0.0, 0.0)),)), moduli())
+    return Case(bar(loads=(em.loads.Traction("right", (5000.0, 0.0, 0.0)),)), moduli())
 
 
 @case("supports")
 def traction_pushing_a_thousand_moduli() -> Case:
-    return Case(bar(loads=(Traction("right", (-5000.0, 0.0, 0.0)),)), moduli())
+    return Case(bar(loads=(em.loads.Traction("right", (-5000.0, 0.0, 0.0)),)), moduli())

@@ -5,16 +5,14 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
-from studies.stability.solver.bodies import bar, moduli, moved
+from studies.stability.solver.bodies import bar, moduli, moved, twist
 from studies.stability.solver.case import CASES, Case, case
 
-from emulator import Support
-from emulator.geometry.generators.box import box
-from emulator.scenes.built_in.boxes import twist
+import emulator as em
 
 
 def _twisted(degrees: float, *, started: bool) -> Case:
-    mesh = box((40.0, 10.0, 10.0), (16, 4, 4))
+    mesh = em.generators.box((40.0, 10.0, 10.0), (16, 4, 4))
     centre = np.array([0.0, 5.0, 5.0])
     right = mesh.node_set("right")
     scene = moved(
@@ -46,6 +44,6 @@ for _degrees in (180, 360, 540):
 def twist_and_pull() -> Case:
     wrung = _twisted(120.0, started=False)
     support = wrung.scene.supports[1]
-    assert isinstance(support, Support)
+    assert isinstance(support, em.Support)
     shift = np.asarray(support.displacement) + np.array([40.0, 0.0, 0.0])
     return Case(moved(wrung.scene, {"left": (0, 0, 0), "right": shift}), moduli())

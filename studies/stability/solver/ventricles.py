@@ -16,11 +16,7 @@ from studies.stability.solver.bodies import (
 )
 from studies.stability.solver.case import SINGLE_STEP, Case, case, near, simulator_of
 
-from emulator import NewtonOptions, Scene, Support
-from emulator.geometry.generators.box import box
-from emulator.geometry.generators.ellipsoid import land_ventricle
-from emulator.geometry.refinement import to_quadratic
-from emulator.scenes.loads import CavityPressure, FollowerPressure
+import emulator as em
 
 
 @case("ventricles")
@@ -60,13 +56,13 @@ def ventricle_suction_30_mmHg() -> Case:
 
 @case("ventricles")
 def ventricle_started_from_suction() -> Case:
-    start = simulator_of(ventricle(), NewtonOptions()).solve(mmHg(-3.0)).displacement
+    start = simulator_of(ventricle(), em.fem.NewtonOptions()).solve(mmHg(-3.0)).displacement
     return Case(ventricle(), mmHg(10.0), start, claim=grows(ventricle(), 1.0))
 
 
 @case("ventricles")
 def ventricle_suction_started_from_30_mmHg() -> Case:
-    start = simulator_of(ventricle(), NewtonOptions()).solve(mmHg(30.0)).displacement
+    start = simulator_of(ventricle(), em.fem.NewtonOptions()).solve(mmHg(30.0)).displacement
     return Case(ventricle(), mmHg(-3.0), start, claim=grows(ventricle(), -1.0))
 
 
@@ -104,11 +100,11 @@ def ventricle_incompressible_mean_30_mmHg() -> Case:
 @case("ventricles")
 def land_beam() -> Case:
     """Problem 1 of Land et al. (2015); 5 % too soft on a mesh this coarse."""
-    mesh = to_quadratic(box((10.0, 1.0, 1.0), (20, 2, 2)))
+    mesh = em.geometry.to_quadratic(em.generators.box((10.0, 1.0, 1.0), (20, 2, 2)))
     scene = guccione(
         mesh,
         along_x(mesh),
-        loads=(FollowerPressure("bottom", 0.004),),
+        loads=(em.loads.FollowerPressure("bottom", 0.004),),
         supports=CLAMPED,
         constants=exponents(8.0, 2.0, 4.0, 1e4),
         dilatation="mean",
@@ -122,13 +118,13 @@ def land_beam() -> Case:
 
 
 @cache
-def land_ellipsoid_scene(pressure: float) -> Scene:
-    mesh = land_ventricle(rings=5, around=12, layers=1, order=2)
+def land_ellipsoid_scene(pressure: float) -> em.Scene:
+    mesh = em.generators.land_ventricle(rings=5, around=12, layers=1, order=2)
     return guccione(
         mesh,
         along_x(mesh),
-        loads=(CavityPressure("endocardium", pressure),),
-        supports=(Support("base"),),
+        loads=(em.loads.CavityPressure("endocardium", pressure),),
+        supports=(em.Support("base"),),
         constants=exponents(1.0, 1.0, 1.0, 1e5),
         dilatation="mean",
     )

@@ -122,5 +122,5 @@ def test_what_is_refused(truth, beam, forward):
 
 @pytest.mark.slow
 def test_nuts_is_calibrated(truth):
-    options = cal.NUTSOptions(warmup=200, draws=300, chains=2, rounds=1)
+    options = cal.samplers.NUTSOptions(warmup=200, draws=300, chains=2, rounds=1)
     assert sbc(truth, 60, options=options, seed=3).passed

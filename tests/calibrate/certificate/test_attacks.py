@@ -15,7 +15,7 @@ from certificate_support import exact_data, grid_of, linear_model, quadrature
 from emulator.surrogates.protocol import Prediction
 from linear_support import LinearForward, LinearSimulator, linear_forward
 
-OPTIONS = cal.NUTSOptions(warmup=300, draws=500, rounds=1)
+OPTIONS = cal.samplers.NUTSOptions(warmup=300, draws=500, rounds=1)
 CLOSE_SD, CLOSE_SPREAD = 0.5, 0.25  # beyond either, no posterior may be accepted
 
 
@@ -50,7 +50,9 @@ def test_gradients_that_are_not_the_map_s(beam, fem, factor):
     wrong = linear_forward(beam, size=0.02, of=WrongGradients, factor=factor)
     model = linear_model(beam, forward=wrong)
     data = exact_data(linear_model(beam, forward=fem))
-    options = cal.NUTSOptions(warmup=100, draws=150, rounds=1)  # a wrong gradient makes long paths
+    options = cal.samplers.NUTSOptions(
+        warmup=100, draws=150, rounds=1
+    )  # a wrong gradient makes long paths
     posterior = cal.sample(model, data, options=options, predictions=False)
     verdict = cal.certify(posterior, LinearSimulator(fem), draws=100).verdict
     points, weights = grid_of(), quadrature(fem, data)

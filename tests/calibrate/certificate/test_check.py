@@ -250,7 +250,7 @@ def test_certify_with_an_inferred_noise(beam):
     )
     noise = 0.3 * np.random.default_rng(1).normal(size=(45, 3))
     data = np.asarray(forward(jnp.array([72.0, 68.0]))) + noise
-    posterior = cal.sample(model, data, options=cal.NUTSOptions(200, 300))
+    posterior = cal.sample(model, data, options=cal.samplers.NUTSOptions(200, 300))
     certificate = cal.certify(posterior, LinearSimulator(forward))
     assert certificate.verdict == "accepted"
     assert set(certificate.shift) == {"mu", "lam", "noise_sd"}
@@ -281,7 +281,7 @@ def test_a_posterior_survives_the_disk(beam, tmp_path):
         forward, cal.nodal_displacements(beam, [3, 11, 20]), cal.GaussianNoise(sd=0.1)
     )
     truth = np.asarray(forward.at(model.observe.nodes)(jnp.array([72.0, 68.0])))
-    posterior = cal.sample(model, truth, options=cal.NUTSOptions(50, 50, rounds=1))
+    posterior = cal.sample(model, truth, options=cal.samplers.NUTSOptions(50, 50, rounds=1))
     posterior.save(tmp_path / "p.nc")
     tree = read_tree(tmp_path / "p.nc")
     assert {"posterior", "sample_stats", "observed_data", "constant_data"} <= set(tree.children)

@@ -171,14 +171,18 @@ def test_locked_elements_are_not_certified():
     model = cal.model(
         emulator.cache(), cal.landmarks(scene, tip), cal.GaussianNoise(sd=0.5), check_scale=False
     )
-    posterior = cal.sample(model, np.asarray(data), options=cal.NUTSOptions(200, 300, 2, rounds=1))
+    posterior = cal.sample(
+        model, np.asarray(data), options=cal.samplers.NUTSOptions(200, 300, 2, rounds=1)
+    )
     alone = cal.certify(posterior, simulator, draws=60, mesh=0)
     whole = cal.certify(posterior, simulator, draws=60)
     assert "no finer mesh was asked" in str(alone)
     assert whole.verdict == "not certified"
     assert any("on a finer mesh" in finding for finding in whole.findings)
     allowed = with_error(model, simulator, 12, of_mesh=True)
-    wide = cal.sample(allowed, np.asarray(data), options=cal.NUTSOptions(200, 300, 2, rounds=1))
+    wide = cal.sample(
+        allowed, np.asarray(data), options=cal.samplers.NUTSOptions(200, 300, 2, rounds=1)
+    )
     for name, value in zip(scene.parameter_names, truth, strict=True):
         row, narrow = wide.summary()[name], posterior.summary()[name]
         assert row["sd"] > 1.5 * narrow["sd"]

@@ -109,7 +109,7 @@ def test_frames_of_a_real_heart_raise_no_doubt(measured, tmp_path):
     pytest.importorskip("gmsh", reason="no gmsh here", exc_type=(ImportError, OSError))
     folder = measured / "human_heart"
     files = {n: folder / f"{file}_018.obj" for n, file in FILES.items()}
-    wall = em.mesh_wall(files[LEFT], files[OUTSIDE], right=files[RIGHT])
+    wall = em.hearts.mesh_wall(files[LEFT], files[OUTSIDE], right=files[RIGHT])
     em.write_mesh(tmp_path / "heart.vtu", wall.mesh)
     scene = em.draft_scene(tmp_path / "heart.vtu", tmp_path / "heart.toml").scene
     assert wall.warnings == ()

@@ -99,7 +99,7 @@ def densities(scene, theta):
     """The energy density of each state, from FEM's potential of a tetrahedron alone."""
     body = tetrahedra(scene)
     count = len(body.mesh.elements)
-    whole, volume = em.strain_energy(body), body.discretisation.weights.sum() / count
+    whole, volume = em.fem.strain_energy(body), body.discretisation.weights.sum() / count
 
     @jax.jit
     def of_each(u):

@@ -17,7 +17,7 @@ from emulator.scenes.supports.dirichlet import Support
 from emulator.verify.homogeneous import SOLUTIONS
 
 MU = 7.0
-SECTOR = em.Tube(2.0, (0.8,), opening_angle=90.0, points=20)
+SECTOR = em.specimens.Tube(2.0, (0.8,), opening_angle=90.0, points=20)
 COLUMNS = {"inner_radius": np.array([1.6, 2.0, 2.6, 3.2]), "stretch_axial": np.full(4, 1.3)}
 
 
@@ -129,7 +129,7 @@ def test_fem_of_a_quarter_of_the_tube_agrees():
     inner = mesh.node_sets["left"]
     radii = np.linalg.norm((nodes + u)[inner, :2], axis=1)
     assert np.ptp(radii) < 2e-3
-    tube = em.Tube(Ri, (wall,))
+    tube = em.specimens.Tube(Ri, (wall,))
     columns = {"inner_radius": [radii.mean()], "stretch_axial": [stretch]}
     pressure, force = predicted(neo_hookean(tube, {k: np.array(v) for k, v in columns.items()}))
     np.testing.assert_allclose(pressure, 1.2, rtol=5e-3)

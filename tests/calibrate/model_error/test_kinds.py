@@ -46,12 +46,12 @@ def of(model, data, **description):
 def test_a_rigid_motion_turns_points_where_they_were_seen_or_at_rest(model, data):
     rest = model.observe.parts[A].points
     made = of(model, data, kind="rigid_motion", of=B, shift=0.5, turn=[1.0, 2.0, 0.0])
-    expected = cal.rigid_motion("e", {B: rest + data[B]}, 0.5, (1.0, 2.0, 0.0))
+    expected = cal.model_error.rigid_motion("e", {B: rest + data[B]}, 0.5, (1.0, 2.0, 0.0))
     assert made.names == expected.names
     assert made.modes.keys() == {B}
     np.testing.assert_array_equal(made.modes[B], expected.modes[B])
     made = of(model, data, kind="rigid_motion", of="displacement", turn=1.0, at="rest")
-    expected = cal.rigid_motion("e", {A: rest, B: rest}, 0.0, 1.0)
+    expected = cal.model_error.rigid_motion("e", {A: rest, B: rest}, 0.0, 1.0)
     for name in (A, B):
         np.testing.assert_array_equal(made.modes[name], expected.modes[name])
     made = of(model, data, kind="rigid_motion", of=A, turn=1.0, at="rest", about=rest[1].tolist())

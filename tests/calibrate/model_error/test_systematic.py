@@ -38,10 +38,12 @@ def positions(model):
 
 @pytest.fixture(scope="module")
 def errors(model):
-    camera = cal.rigid_motion(
+    camera = cal.model_error.rigid_motion(
         "camera", {"displacement@b": positions(model)["displacement@b"]}, 0.5, (1.0, 2.0, 0.0)
     )
-    return camera, cal.placement("pin", tuple(model.observe.parts), np.full((3, 3), 0.2))
+    return camera, cal.model_error.placement(
+        "pin", tuple(model.observe.parts), np.full((3, 3), 0.2)
+    )
 
 
 def dense(model, errors):
@@ -119,7 +121,9 @@ def test_a_camera_that_turned_is_told_from_material(model):
     means, _ = model.predict(DRAW)
     seen = (at["displacement@b"] - centre) @ turn.T + centre
     data = {**means, "displacement@b": means["displacement@b"] + seen - at["displacement@b"]}
-    camera = cal.rigid_motion("camera", {"displacement@b": at["displacement@b"]}, 0.5, 2.0)
+    camera = cal.model_error.rigid_motion(
+        "camera", {"displacement@b": at["displacement@b"]}, 0.5, 2.0
+    )
     quiet = cal.model(model.full, dict(model.observe.parts), cal.GaussianNoise(sd=1e-3))
     whole = cal.with_systematic(quiet, camera)
     told, covariance = whole.error.unknowns({n: data[n] - means[n] for n in means})
@@ -134,12 +138,12 @@ def test_data_may_be_as_far_off_as_its_errors_are(model):
     data = {name: np.full((3, 3), 10.0) for name in model.observe.parts}
     with pytest.raises(InputError, match="larger than predicted"):
         model.check_data(data)
-    camera = cal.rigid_motion("camera", positions(model), 10.0, 0.0)
+    camera = cal.model_error.rigid_motion("camera", positions(model), 10.0, 0.0)
     assert cal.with_systematic(model, camera).check_data(data).keys() == data.keys()
 
 
 def test_nothing_unknown_changes_nothing(model):
-    still = cal.rigid_motion("camera", positions(model), 0.0, 0.0)
+    still = cal.model_error.rigid_motion("camera", positions(model), 0.0, 0.0)
     whole, data = cal.with_systematic(model, still), some_data(model)
     expected = float(model.map_log_likelihood(DRAW, data))
     assert float(whole.map_log_likelihood(DRAW, data)) == pytest.approx(expected, rel=1e-14)
@@ -147,7 +151,7 @@ def test_nothing_unknown_changes_nothing(model):
 
 def test_a_placement_is_one_offset_a_number_shared_by_states():
     sd = np.array([[0.1, 0.2, 0.3]])
-    pins = cal.placement("pin", ("a", "b"), sd)
+    pins = cal.model_error.placement("pin", ("a", "b"), sd)
     assert pins.names == ("pin 0,0", "pin 0,1", "pin 0,2")
     for modes in pins.modes.values():
         np.testing.assert_array_equal(modes[:, 0], np.diag(sd[0]))
@@ -187,7 +191,7 @@ def test_what_cannot_be(model, errors):
     with pytest.raises(InputError, match="a size is called 'lam', as an unknown of the model"):
         cal.with_systematic(model, sized)
     with pytest.raises(InputError, match="camera: sds -1 mm"):
-        cal.rigid_motion("camera", positions(model), -1, 0.0)
+        cal.model_error.rigid_motion("camera", positions(model), -1, 0.0)
 
 
 AT = np.array([0.0, 0.1, 0.3, -0.2])

@@ -45,7 +45,7 @@ def found(beam):
     gappy = cal.model(model.full, observe, cal.GaussianNoise(sd_scale=0.1), check_scale=False)
     members["b2"][1][1, 2] = np.nan
     members["b2"] = (gappy, members["b2"][1])
-    return cal.hierarchy(members, options=SHORT, alone="laplace", seed=3)
+    return cal.population.hierarchy(members, options=SHORT, alone="laplace", seed=3)
 
 
 def close(values, mean, sd, ess):
@@ -63,7 +63,7 @@ def test_the_mean_of_linear_gaussian_members_is_normal(beam):
     model = model_of(scene, known={"lam": 80.0}, prior={"mu": dist.Uniform(1.0, 160.0)})
     truth = 75.0 + 5.0 * np.random.default_rng(1).normal(size=3)
     members = {f"b{i}": (model, data_of(model, [t], i)) for i, t in enumerate(truth)}
-    found = cal.hierarchy(
+    found = cal.population.hierarchy(
         members,
         median={"mu": dist.Normal(80.0, 10.0)},
         spread={"mu": dist.LogNormal(np.log(5.0), 1e-3)},
@@ -91,18 +91,18 @@ def test_the_mean_of_linear_gaussian_members_is_normal(beam):
 
 @pytest.mark.slow
 def test_one_member_has_its_posterior_under_the_population(beam):
-    """Of a known population, which as a prior is cal.Population."""
+    """Of a known population, which as a prior is cal.priors.Population."""
     known = {"lam": 90.0}
     model = model_of(beam, known=known)
     data = data_of(model, [58.0], 7)
-    found = cal.hierarchy(
+    found = cal.population.hierarchy(
         {"only": (model, data)},
         median={"mu": dist.LogNormal(np.log(60.0), 0.01)},
         spread={"mu": dist.LogNormal(np.log(0.1), 0.01)},
         options=SHORT,
         alone="laplace",
     )
-    prior = cal.Population(median={"mu": 60.0}, log_sd={"mu": 0.1}).prior(beam)
+    prior = cal.priors.Population(median={"mu": 60.0}, log_sd={"mu": 0.1}).prior(beam)
     alone = cal.sample(
         model_of(beam, known=known, prior=prior), data, options=SHORT, predictions=False
     )
@@ -185,7 +185,7 @@ def test_it_is_a_prior_of_the_next_member(found, beam):
 @pytest.mark.slow
 def test_it_is_kept_in_a_file(found, tmp_path):
     found.save(tmp_path / "hierarchy.nc")
-    again = cal.read_hierarchy(tmp_path / "hierarchy.nc")
+    again = cal.population.read_hierarchy(tmp_path / "hierarchy.nc")
     assert again.members == found.members
     assert again.summary() == found.summary()
     assert again.shrinkage() == found.shrinkage()
@@ -206,7 +206,7 @@ def test_a_file_of_something_else_is_refused(tmp_path, beam):
     data = data_of(model, [70.0, 80.0], 0)
     cal.sample(model, data, options=options, predictions=False).save(tmp_path / "posterior.nc")
     with pytest.raises(InputError, match="holds no hierarchy"):
-        cal.read_hierarchy(tmp_path / "posterior.nc")
+        cal.population.read_hierarchy(tmp_path / "posterior.nc")
 
 
 @pytest.mark.parametrize(
@@ -232,7 +232,7 @@ def test_bad_words_are_refused(beam, more, words):
     model = model_of(beam)
     data = np.zeros((3, 3))
     with pytest.raises(InputError) as error:
-        cal.hierarchy({"one": (model, data), "two": (model, data)}, **more)
+        cal.population.hierarchy({"one": (model, data), "two": (model, data)}, **more)
     assert words in str(error.value)
     assert "\n" not in str(error.value)
 
@@ -245,17 +245,17 @@ def test_members_of_other_ranges_or_scales_are_refused(beam):
     ):
         second = model_of(replace(beam, parameters=(other, beam.parameters[1])))
         with pytest.raises(InputError, match="'mu' is 50 to 100 kPa .log. for 'one' and 50 to 1"):
-            cal.hierarchy({"one": (model, data), "two": (second, data)})
+            cal.population.hierarchy({"one": (model, data), "two": (second, data)})
     with pytest.raises(InputError, match="no members"):
-        cal.hierarchy({})
+        cal.population.hierarchy({})
 
 
 def test_own_unknowns_that_depend_on_shared_ones_are_refused(beam):
-    prior = cal.Population(
+    prior = cal.priors.Population(
         median={"mu": 70.0, "lam": 70.0},
         log_sd={"mu": 0.1, "lam": 0.1},
         correlation={"mu,lam": 0.5},
     ).prior(beam)
     model = model_of(beam, prior=prior)
     with pytest.raises(InputError, match="correlates mu, lam, of which only some follow"):
-        cal.hierarchy({"one": (model, np.zeros((3, 3)))}, shared=("mu",))
+        cal.population.hierarchy({"one": (model, np.zeros((3, 3)))}, shared=("mu",))

@@ -132,7 +132,7 @@ def model(beam):
 def test_a_range_is_a_box_unless_something_else_is_said(model, beam):
     assert list(model().box) == ["mu", "lam"]
     assert list(model(bounded=("mu",)).box) == ["lam"]
-    assert list(model(prior={"mu": cal.box_prior(beam)["mu"]}).box) == ["lam"]
+    assert list(model(prior={"mu": cal.priors.box_prior(beam)["mu"]}).box) == ["lam"]
     assert list(model(known={"lam": 70.0}).box) == ["mu"]
     with pytest.raises(InputError, match="bounded: 'nu' is not inferred; inferred: mu, lam"):
         model(bounded=("nu",))
@@ -141,7 +141,7 @@ def test_a_range_is_a_box_unless_something_else_is_said(model, beam):
 def test_data_that_want_more_than_the_box_are_told(beam, model):
     """Nearly noise-free data of a body softer than the range: a warning, unless nature ends there."""
     exact = linear_forward(beam).at(np.array([3, 11]))(beam.centre.at[0].set(44.0))
-    options = cal.NUTSOptions(warmup=200, draws=300, chains=2, rounds=1)
+    options = cal.samplers.NUTSOptions(warmup=200, draws=300, chains=2, rounds=1)
     for bounded in ((), ("mu", "lam")):
         posterior = cal.sample(
             model(bounded=bounded, check_scale=False), exact, options=options, predictions=False

@@ -58,7 +58,7 @@ def problems(beam):
 @pytest.fixture(scope="module")
 def posteriors(problems):
     models, data = problems
-    options = cal.NUTSOptions(300, 1000, chains=2, rounds=1)
+    options = cal.samplers.NUTSOptions(300, 1000, chains=2, rounds=1)
     return {name: cal.sample(model, data, options=options) for name, model in models.items()}
 
 
@@ -87,7 +87,7 @@ def test_scores_are_the_closed_form_s(problems, trees):
 
 def test_a_model_and_itself_are_not_told_apart(problems, trees):
     models, data = problems
-    options = cal.NUTSOptions(300, 1000, chains=2, rounds=1)
+    options = cal.samplers.NUTSOptions(300, 1000, chains=2, rounds=1)
     again = cal.sample(models["right"], data, options=options, seed=5).tree
     verdict = compare({"one": trees["right"], "two": again}).verdict
     assert verdict.startswith("not decided: ")

@@ -125,7 +125,7 @@ def test_prior_predictions_that_are_fewer_than_asked_for_are_told(beam):
     tip = cal.nodal_displacements(beam, [40])
     model = cal.model(forward, tip, cal.GaussianNoise(sd=0.2), check_scale=False)
     data = np.asarray(model.forward(jnp.array([60.0, 60.0])))
-    options = cal.NUTSOptions(warmup=20, draws=20, chains=1)
+    options = cal.samplers.NUTSOptions(warmup=20, draws=20, chains=1)
     found = cal.sample(model, data, options=options)
     count = found.tree["prior"].sizes["draw"]
     assert 50 < count < 400

@@ -12,7 +12,7 @@ from certificate_support import linear_model
 def model(beam):
     """Of two moduli, with log-normal priors of 75 kPa and log sd 0.05, which fit into the box."""
     bare = linear_model(beam)
-    prior = {"mu": cal.log_normal(75.0, 0.05), "lam": cal.log_normal(75.0, 0.05)}
+    prior = {"mu": cal.priors.log_normal(75.0, 0.05), "lam": cal.priors.log_normal(75.0, 0.05)}
     return cal.model(bare.full, bare.observe, cal.GaussianNoise(sd=0.1), prior)
 
 

@@ -29,7 +29,7 @@ GROUPS = {
 @pytest.fixture(scope="module")
 def posterior(beam):
     model, data = linear_problem(beam)
-    return cal.sample(model, data, options=cal.NUTSOptions(200, 300, chains=2, rounds=1))
+    return cal.sample(model, data, options=cal.samplers.NUTSOptions(200, 300, chains=2, rounds=1))
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +118,7 @@ def test_the_prior_is_the_prior_where_the_map_answers(beam):
     prior = {name: dist.Uniform(60.0, 80.0) for name in beam.parameter_names}
     model = cal.model(forward, observe, noise, prior)
     posterior = cal.sample(
-        model, np.zeros((1, 3)), options=cal.NUTSOptions(50, 50, chains=1, rounds=1)
+        model, np.zeros((1, 3)), options=cal.samplers.NUTSOptions(50, 50, chains=1, rounds=1)
     )
     drawn = posterior.tree["prior"]["mu"].values
     assert 60.0 < drawn.min() < 61.0
@@ -127,7 +127,7 @@ def test_the_prior_is_the_prior_where_the_map_answers(beam):
 
 def test_predictions_can_be_left_out(beam):
     model, data = linear_problem(beam)
-    options = cal.NUTSOptions(50, 50, chains=1, rounds=1)
+    options = cal.samplers.NUTSOptions(50, 50, chains=1, rounds=1)
     tree = cal.sample(model, data, options=options, predictions=False).tree
     assert set(tree.children) == {"posterior", "sample_stats", "observed_data", "constant_data"}
 
@@ -148,7 +148,7 @@ def test_correlated_noise_and_missing_values_have_their_groups(beam):
     model = cal.model(forward, observe, noise)
     data = np.array(forward.at(observe.nodes)(jnp.array([72.0, 68.0])))
     data[1, 2] = np.nan
-    options = cal.NUTSOptions(100, 500, chains=1, rounds=1)
+    options = cal.samplers.NUTSOptions(100, 500, chains=1, rounds=1)
     tree = cal.sample(model, data, options=options).tree
     assert tree["log_likelihood"]["displacement"].sizes["entry_displacement"] == 8
     assert az.loo(tree).n_data_points == 8
@@ -166,7 +166,7 @@ def test_a_single_number_is_plotted_too(ventricle):
     forward = linear_forward(ventricle, size=1.0)
     noise = cal.GaussianNoise(sd=4.0)
     model = cal.model(forward, cal.CavityVolume(ventricle), noise, check_scale=False)
-    options = cal.NUTSOptions(50, 60, chains=1, rounds=1)
+    options = cal.samplers.NUTSOptions(50, 60, chains=1, rounds=1)
     tree = cal.sample(model, {"volume": 120.0}, options=options).tree
     assert tree["observed_data"]["volume"].dims == ("volume_number",)
     assert tree["log_likelihood"]["volume"].dims == ("chain", "draw", "volume_number")

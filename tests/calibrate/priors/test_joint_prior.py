@@ -33,7 +33,10 @@ def model_of(beam, prior, **more):
 
 
 def log_normals(scale=0.1):
-    return {"mu": cal.log_normal(75.0, scale), "lam": cal.log_normal(70.0, 2.0 * scale)}
+    return {
+        "mu": cal.priors.log_normal(75.0, scale),
+        "lam": cal.priors.log_normal(70.0, 2.0 * scale),
+    }
 
 
 def log_prior_of(model, **values):
@@ -56,7 +59,7 @@ def test_correlated_log_normals_are_a_normal_of_logarithms(beam):
 
 
 def test_cut_to_a_range_its_density_is_normalised(beam):
-    prior = cal.truncated(
+    prior = cal.priors.truncated(
         JointPrior(log_normals(0.2), Dependence(("lam", "mu"), HALF)), beam
     )  # names in another order than theta's
     assert isinstance(prior, JointPrior)
@@ -81,7 +84,9 @@ def test_cut_to_a_range_its_density_is_normalised(beam):
 
 
 def test_draws_have_marginals_and_correlation(beam):
-    prior = cal.truncated(JointPrior(log_normals(0.2), Dependence(("mu", "lam"), HALF)), beam)
+    prior = cal.priors.truncated(
+        JointPrior(log_normals(0.2), Dependence(("mu", "lam"), HALF)), beam
+    )
     model = model_of(beam, prior)
     direct = model.prior_draws(jax.random.key(0), 4000)
     traced = predictions.prior_replicates(model, jax.random.key(1), 4000).draws
@@ -112,7 +117,7 @@ def test_nuts_meets_the_closed_form_posterior(beam):
     )
     mean = np.array([75.0, 70.0]) + np.linalg.solve(precision, J.T @ gap / NOISE.sd**2)
     covariance = np.linalg.inv(precision)
-    options = cal.NUTSOptions(warmup=300, draws=500, chains=2)
+    options = cal.samplers.NUTSOptions(warmup=300, draws=500, chains=2)
     draws = cal.sample(model, data, options=options, seed=1, predictions=False).draws()
     table = np.stack([draws[name] for name in order], axis=1)
     found = np.sqrt(np.diag(covariance))
@@ -124,7 +129,9 @@ def test_nuts_meets_the_closed_form_posterior(beam):
 @pytest.mark.slow
 def test_density_and_draws_of_the_prior_agree(beam):
     """E_prior of score is zero: the density the samplers see is the one the draws come from."""
-    prior = cal.truncated(JointPrior(log_normals(0.2), Dependence(("mu", "lam"), HALF)), beam)
+    prior = cal.priors.truncated(
+        JointPrior(log_normals(0.2), Dependence(("mu", "lam"), HALF)), beam
+    )
     density = density_of(model_of(beam, prior))
     z = jax.vmap(density.prior_draw)(jax.random.split(jax.random.key(2), 4000))
     gradients = np.asarray(jax.vmap(jax.grad(density.log_prior))(z))
@@ -157,19 +164,19 @@ def test_provenance_names_the_correlation(beam):
     model = model_of(beam, JointPrior(log_normals(), Dependence(("mu", "lam"), HALF)))
     from calibrate.posterior.posterior import provenance
 
-    found = provenance(model, 0, "nuts", cal.NUTSOptions())["prior_dependence"]
+    found = provenance(model, 0, "nuts", cal.samplers.NUTSOptions())["prior_dependence"]
     assert found == {"names": list(model.states.unknowns), "correlation": HALF.tolist()}
 
 
 def test_the_population_of_fits_is_found_again():
     rng = np.random.default_rng(0)
     logs = rng.multivariate_normal([0.0, 1.0], 0.04 * HALF, 2000).T
-    found = cal.population_of_fits({"a": np.exp(logs[0]), "a_f": np.exp(logs[1])}, "made up")
+    found = cal.priors.population_of_fits({"a": np.exp(logs[0]), "a_f": np.exp(logs[1])}, "made up")
     assert found.median == pytest.approx({"a": 1.0, "a_f": np.e}, rel=0.02)
     assert found.log_sd == pytest.approx({"a": 0.2, "a_f": 0.2}, rel=0.06)
     assert found.correlation == pytest.approx({"a,a_f": -0.8}, abs=0.03)
     with pytest.raises(InputError, match="4 subjects or more"):
-        cal.population_of_fits({"a": [1.0, 2.0, 3.0], "b": [1.0, 2.0, 2.5]})
+        cal.priors.population_of_fits({"a": [1.0, 2.0, 3.0], "b": [1.0, 2.0, 2.5]})
 
 
 def test_the_default_ventricles_fit_the_scene():
@@ -188,11 +195,11 @@ def test_the_default_ventricles_fit_the_scene():
 
 def test_a_run_takes_names_files_and_numbers(tmp_path, beam):
     numbers = asdict(
-        cal.Population({"mu": 75.0, "lam": 70.0}, {"mu": 0.1, "lam": 0.2}, {"mu,lam": 0.5})
+        cal.priors.Population({"mu": 75.0, "lam": 70.0}, {"mu": 0.1, "lam": 0.2}, {"mu,lam": 0.5})
     )
     path = tmp_path / "cohort.json"
     path.write_text(json.dumps(numbers))
-    assert asdict(read_json_as(cal.Population, path)) == numbers
+    assert asdict(read_json_as(cal.priors.Population, path)) == numbers
     assert Run("once_clamped_beam", prior=numbers).prior == numbers
     found = prior_of(numbers, beam)
     assert found.dependence.correlation[0, 1] == 0.5
@@ -203,7 +210,7 @@ def test_a_run_takes_names_files_and_numbers(tmp_path, beam):
         prior_of("ventricles", beam)
     path.write_text(json.dumps({**numbers, "correlation": {"mu,nu": 0.5}}))
     with pytest.raises(InputError, match="correlation 'mu,nu': give two of mu, lam"):
-        read_json_as(cal.Population, path)
+        read_json_as(cal.priors.Population, path)
 
 
 @pytest.mark.slow

@@ -35,7 +35,7 @@ def bounded(beam):
 
 
 def model_with(forward, beam, mu):
-    prior = {**cal.box_prior(beam), "mu": mu}
+    prior = {**cal.priors.box_prior(beam), "mu": mu}
     return cal.model(forward, cal.nodal_displacements(beam, [3, 11]), NOISE, prior)
 
 
@@ -71,11 +71,15 @@ def test_a_negligible_mass_is_cut_off_and_recorded(bounded, beam):
 @pytest.mark.slow
 def test_a_prior_cut_by_request_is_sampled(bounded, beam):
     """Half of the normal's mass lies above the box."""
-    prior = cal.truncated({**cal.box_prior(beam), "mu": dist.Normal(100.0, 5.0)}, beam)
+    prior = cal.priors.truncated(
+        {**cal.priors.box_prior(beam), "mu": dist.Normal(100.0, 5.0)}, beam
+    )
     model = cal.model(bounded, cal.nodal_displacements(beam, [3]), cal.GaussianNoise(sd=1e3), prior)
     assert model.prior_cut == {}
     data = np.asarray(model.forward(jnp.array([90.0, 70.0])))
-    posterior = cal.sample(model, data, options=cal.NUTSOptions(200, 500, rounds=2), seed=1)
+    posterior = cal.sample(
+        model, data, options=cal.samplers.NUTSOptions(200, 500, rounds=2), seed=1
+    )
     draws = posterior.draws()["mu"]
     assert draws.max() <= 100.0
     # Such noise says nothing: half-normal, mean 100 - 5 sqrt(2 / pi).
@@ -97,7 +101,9 @@ def test_a_map_without_a_box_takes_any_prior_and_chains_start(beam):
     model = cal.model(forward, cal.nodal_displacements(beam, [3, 11]), NOISE, prior)
     assert model.prior_cut == {}
     data = np.asarray(model.forward(jnp.array([115.0, 60.0])))
-    posterior = cal.sample(model, data, options=cal.NUTSOptions(200, 200, chains=2, rounds=1))
+    posterior = cal.sample(
+        model, data, options=cal.samplers.NUTSOptions(200, 200, chains=2, rounds=1)
+    )
     table = posterior.summary()
     for name, truth in (("mu", 115.0), ("lam", 60.0)):
         assert abs(table[name]["mean"] - truth) < 4.0 * table[name]["sd"]
@@ -113,7 +119,7 @@ def test_the_posterior_beyond_the_box_is_the_known_one(beam):
     prior = {n: dist.Normal(m, s) for n, m, s in zip(beam.parameter_names, mean, sd, strict=True)}
     model = cal.model(forward, observe, NOISE, prior)
     data = np.asarray(model.forward(jnp.array([100.3, 70.0])))
-    posterior = cal.sample(model, data, options=cal.NUTSOptions(200, 500, rounds=2))
+    posterior = cal.sample(model, data, options=cal.samplers.NUTSOptions(200, 500, rounds=2))
     known, covariance = closed_form(forward, observe.nodes, data, 0.1, mean, sd)
     draws, ess = posterior.draws()["mu"], posterior.summary()["mu"]["ess_bulk"]
     assert abs(draws.mean() - known[0]) < 4 * np.sqrt(covariance[0, 0] / ess)
@@ -133,7 +139,9 @@ def test_fem_with_a_normal_prior_in_the_sampler(beam, simulator):
     observe = cal.nodal_displacements(beam, nodes)
     model = cal.model(fem_forward(simulator), observe, cal.GaussianNoise(sd=0.05), prior)
     data = np.asarray(simulator(jnp.array([112.0, 70.0]))[nodes])
-    posterior = cal.sample(model, data, options=cal.NUTSOptions(15, 15, chains=2, rounds=1))
+    posterior = cal.sample(
+        model, data, options=cal.samplers.NUTSOptions(15, 15, chains=2, rounds=1)
+    )
     draws = posterior.draws()["mu"]
     assert abs(draws.mean() - 112.0) < 15.0
     assert draws.max() > 100.0
@@ -143,9 +151,9 @@ def test_fem_with_a_normal_prior_in_the_sampler(beam, simulator):
 @pytest.mark.parametrize(
     ("ours", "theirs"),
     [
-        (cal.truncated_normal(3.0, 2.0, 1.0, 4.0), stats.truncnorm(-1.0, 0.5, 3.0, 2.0)),
-        (cal.truncated_normal(3.0, 2.0, low=1.0), stats.truncnorm(-1.0, np.inf, 3.0, 2.0)),
-        (cal.log_normal(5.0, 0.3), stats.lognorm(0.3, scale=5.0)),
+        (cal.priors.truncated_normal(3.0, 2.0, 1.0, 4.0), stats.truncnorm(-1.0, 0.5, 3.0, 2.0)),
+        (cal.priors.truncated_normal(3.0, 2.0, low=1.0), stats.truncnorm(-1.0, np.inf, 3.0, 2.0)),
+        (cal.priors.log_normal(5.0, 0.3), stats.lognorm(0.3, scale=5.0)),
     ],
 )
 def test_constructors_against_scipy(ours, theirs):
@@ -177,10 +185,10 @@ def test_a_truncated_distribution_against_scipy(base, theirs):
 
 
 def test_log_normal_is_cut_where_asked():
-    cut = cal.log_normal(70.0, 0.2, low=50.0, high=100.0)
+    cut = cal.priors.log_normal(70.0, 0.2, low=50.0, high=100.0)
     assert np.isinf(cut.log_prob(49.0))
     assert np.isfinite(cut.log_prob(50.1))
-    assert np.isfinite(cal.log_normal(70.0, 0.2, low=50.0).log_prob(200.0))
+    assert np.isfinite(cal.priors.log_normal(70.0, 0.2, low=50.0).log_prob(200.0))
 
 
 def test_standardised_coordinates_change_no_density():
@@ -198,10 +206,10 @@ def test_standardised_coordinates_change_no_density():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: cal.truncated_normal(1.0, 0.0), "sd is 0.0"),
-        (lambda: cal.truncated_normal(1.0, 1.0, 3.0, 2.0), "no value lies between 3 and 2"),
-        (lambda: cal.log_normal(-1.0, 1.0), "median is -1.0"),
-        (lambda: cal.log_normal(1.0, 1.0, low=3.0, high=2.0), "no value lies between"),
+        (lambda: cal.priors.truncated_normal(1.0, 0.0), "sd is 0.0"),
+        (lambda: cal.priors.truncated_normal(1.0, 1.0, 3.0, 2.0), "no value lies between 3 and 2"),
+        (lambda: cal.priors.log_normal(-1.0, 1.0), "median is -1.0"),
+        (lambda: cal.priors.log_normal(1.0, 1.0, low=3.0, high=2.0), "no value lies between"),
     ],
 )
 def test_constructors_refuse_what_makes_no_sense(make, message):
@@ -210,9 +218,9 @@ def test_constructors_refuse_what_makes_no_sense(make, message):
 
 
 def test_a_prior_entirely_outside_the_box(beam):
-    prior = {**cal.box_prior(beam), "mu": dist.Uniform(200.0, 300.0)}
+    prior = {**cal.priors.box_prior(beam), "mu": dist.Uniform(200.0, 300.0)}
     with pytest.raises(InputError, match="prior Uniform lies outside 50 to 100"):
-        cal.truncated(prior, beam)
+        cal.priors.truncated(prior, beam)
 
 
 @pytest.mark.parametrize(

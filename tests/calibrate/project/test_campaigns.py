@@ -87,7 +87,7 @@ def test_a_store_is_a_dataset(scene, tmp_path):
     assert words[found["status"].attrs["flag_values"].index(2)] == "load_limit"
     simulator, theta = em.Simulator(scene), sobol(scene, 4, 0)[2]
     np.testing.assert_allclose(found["displacement"][2], simulator(theta), atol=1e-8)
-    energy = jax.jit(em.potential_energy(scene))(simulator(theta), theta)
+    energy = jax.jit(em.fem.potential_energy(scene))(simulator(theta), theta)
     np.testing.assert_allclose(found["energy"][2], energy, rtol=1e-8)
     slopes = simulator.sensitivities(simulator(theta), theta)
     np.testing.assert_allclose(found["sensitivities"][2], slopes, atol=1e-8)

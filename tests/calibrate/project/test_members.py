@@ -85,7 +85,7 @@ def result(folder, tmp_path_factory):
 
 
 def test_the_population_and_its_members_are_kept(result):
-    found = cal.read_hierarchy(result / "posterior.nc")
+    found = cal.population.read_hierarchy(result / "posterior.nc")
     assert found.shared == ("mu",)
     assert found.members == tuple(TRUTHS)
     for name, mu in TRUTHS.items():

@@ -159,7 +159,7 @@ def test_a_tube_has_its_files_by_one_command(tmp_path, monkeypatch, capsys):
     assert told["states"] == 3
     assert told["parameters"] == ["c", "k_1", "k_2", "angle", "stiffness_2"]
     scene = read_scene(tmp_path / "tube_scene.toml")
-    assert scene.tube == em.Tube(4.6, (0.9, 0.5))
+    assert scene.tube == em.specimens.Tube(4.6, (0.9, 0.5))
     assert set(np.unique(scene.regions)) == {1, 2}
     assert set(read_experiment(tmp_path / "tube.toml").run.noise) == {"tube_pressure", "tube_force"}
     for words, told in (

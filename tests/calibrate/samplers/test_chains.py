@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calibrate.samplers import Context, NUTSOptions, density_of
+from calibrate.samplers import NUTSOptions, density_of
 from calibrate.samplers.chains import Chains, Programs
 from calibrate.samplers.nuts import NUTS
+from calibrate.samplers.protocol import Context
 from linear_support import PRIOR_MEAN, PRIOR_SD, closed_form, linear_forward, linear_problem
 
 

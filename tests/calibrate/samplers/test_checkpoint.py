@@ -119,7 +119,7 @@ def test_slow_iterations_are_shown_and_kept_one_by_one(problem, monkeypatch, tmp
 def test_the_checkpoint_of_another_run_is_refused(problem, change, message, monkeypatch, tmp_path):
     path = tmp_path / "sampling.safetensors"
     model, data = problem
-    options = cal.NUTSOptions(50, 50, chains=2)
+    options = cal.samplers.NUTSOptions(50, 50, chains=2)
     call = partial(cal.sample, model, options=options, seed=5, checkpoint=path)
     with monkeypatch.context() as patch:
         kill_after(patch, 1)

@@ -255,9 +255,9 @@ def test_a_step_without_any_answer_is_named():
 
 def test_the_sampler_is_that_of_the_options():
     assert find_sampler(None).name == "auto"
-    assert find_sampler(None, cal.NUTSOptions()).name == "nuts"
+    assert find_sampler(None, cal.samplers.NUTSOptions()).name == "nuts"
     assert find_sampler(None, ImportanceOptions()).name == "importance"
-    assert find_sampler("smc", cal.NUTSOptions()).name == "smc"
+    assert find_sampler("smc", cal.samplers.NUTSOptions()).name == "smc"
 
 
 def test_points_in_separate_places_have_a_covariance_each():

@@ -34,7 +34,7 @@ def problem(beam):
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_draws(problem):
     _, _, model, data = problem
-    options = cal.NUTSOptions(100, 50, rounds=1)
+    options = cal.samplers.NUTSOptions(100, 50, rounds=1)
     a, b, c = (cal.sample(model, data, options=options, seed=s).draws()["mu"] for s in (3, 3, 4))
     np.testing.assert_array_equal(a, b)
     assert not np.array_equal(a, c)
@@ -47,7 +47,7 @@ def test_unknown_noise_is_inferred(beam):
     model = cal.model(forward, observe, cal.GaussianNoise(sd_scale=1.0))
     noise = 0.3 * np.random.default_rng(1).normal(size=(45, 3))
     data = np.asarray(forward(jnp.array([72.0, 68.0]))) + noise
-    posterior = cal.sample(model, data, options=cal.NUTSOptions(300, 500))
+    posterior = cal.sample(model, data, options=cal.samplers.NUTSOptions(300, 500))
     row = posterior.summary()["noise_sd"]
     assert row["r_hat"] < 1.01
     # 135 residuals fix a standard deviation to about 6 %.
@@ -61,7 +61,7 @@ def test_no_draw_lies_where_the_forward_map_is_invalid(beam):
 
     forward = replace(linear_forward(beam), limit=80.0)
     model = cal.model(forward, cal.nodal_displacements(beam, [3]), cal.GaussianNoise(sd=10.0))
-    posterior = cal.sample(model, np.zeros((1, 3)), options=cal.NUTSOptions(200, 200))
+    posterior = cal.sample(model, np.zeros((1, 3)), options=cal.samplers.NUTSOptions(200, 200))
     for values in posterior.draws().values():
         assert values.max() < 80.0
 
@@ -71,7 +71,7 @@ def test_no_draw_lies_where_the_forward_map_is_invalid(beam):
 )
 def test_options_that_cannot_work(options):
     with pytest.raises(InputError, match=f"NUTS: {next(iter(options))} is"):
-        cal.NUTSOptions(**options)
+        cal.samplers.NUTSOptions(**options)
 
 
 @pytest.mark.slow
@@ -87,7 +87,9 @@ def test_fem_inside_the_sampler(beam, simulator, kind):
     model = cal.model(forward, cal.nodal_displacements(beam, nodes), cal.GaussianNoise(sd=0.05))
     data = np.asarray(simulator(theta)[nodes])
     data = data + 0.05 * np.random.default_rng(0).normal(size=data.shape)
-    posterior = cal.sample(model, data, options=cal.NUTSOptions(15, 15, chains=2, rounds=1))
+    posterior = cal.sample(
+        model, data, options=cal.samplers.NUTSOptions(15, 15, chains=2, rounds=1)
+    )
     draws = posterior.draws()["mu"]
     assert np.isfinite(draws).all()
     assert abs(draws.mean() - 73.0) < 10.0  # too few draws for more than the right place

@@ -58,7 +58,9 @@ def test_a_linear_gaussian_posterior_is_the_known_one(name, problem, beam):
 def test_one_chain_stops_and_has_an_r_hat(problem):
     model, data = problem
     # 1500 draws of an easy posterior meet the default limits; without the rule, 8 rounds follow.
-    posterior = cal.sample(model, data, options=cal.NUTSOptions(400, 1500, chains=1), seed=1)
+    posterior = cal.sample(
+        model, data, options=cal.samplers.NUTSOptions(400, 1500, chains=1), seed=1
+    )
     assert posterior.tree["posterior"].sizes["draw"] < 8 * 1500
     assert all(1.0 <= row["r_hat"] + 1e-2 < 1.03 for row in posterior.summary().values())
 
@@ -88,7 +90,7 @@ def test_as_many_chains_at_once_as_the_map_bears(beam, simulator, monkeypatch):
 def test_options_by_name():
     nuts, length = find_sampler("nuts"), {"warmup": 5, "draws": 6, "chains": 7}
     options = options_from(nuts, {"target_accept": 0.95, "rounds": 2}, **length)
-    assert options == cal.NUTSOptions(5, 6, 7, target_accept=0.95, rounds=2)
+    assert options == cal.samplers.NUTSOptions(5, 6, 7, target_accept=0.95, rounds=2)
     with pytest.raises(InputError, match="'nuts': unknown key 'leapfrogs'; known: chains, draws"):
         options_from(nuts, {"leapfrogs": 3}, **length)
     with pytest.raises(InputError, match="'nuts': rounds = \"two\"; expected a whole number"):

@@ -31,7 +31,7 @@ def test_two_modes_that_nuts_gets_wrong_have_their_shares(two_modes):
     assert attributes["log_evidence"] == pytest.approx(log_evidence, abs=0.1)
     assert 0.0 < attributes["log_evidence_error"] < 0.1
 
-    stuck = cal.sample(model, data, options=cal.NUTSOptions(300, 300, rounds=2), seed=1)
+    stuck = cal.sample(model, data, options=cal.samplers.NUTSOptions(300, 300, rounds=2), seed=1)
     upper = (stuck.tree["posterior"]["mu"].values > 75).mean(axis=1)
     assert set(upper) <= {0.0, 1.0}
     assert stuck.summary()["mu"]["r_hat"] > 1.5

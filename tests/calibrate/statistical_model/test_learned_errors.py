@@ -204,7 +204,7 @@ def test_a_poor_map_widens_the_posterior_instead_of_moving_it(truth, poor, aware
 @pytest.mark.slow
 def test_nuts_and_replicated_data_know_of_it(truth, aware):
     data = np.asarray(truth.at(NODES)(TRUTH))
-    options = cal.NUTSOptions(warmup=200, draws=300, chains=2, rounds=1)
+    options = cal.samplers.NUTSOptions(warmup=200, draws=300, chains=2, rounds=1)
     posterior = sample(aware, data, options=options)
     table = posterior.summary()
     for name, value in zip(("mu", "lam"), TRUTH, strict=True):

@@ -30,7 +30,7 @@ def test_loads_belong_to_a_state_and_the_material_does_not(ventricle):
     # In one state without a name a parameter keeps its own name.
     assert load_states(ventricle, ("",))[0].unknowns == ventricle.parameter_names
     # A prior under the bare name is each state's.
-    given = {**cal.box_prior(ventricle), "pressure": dist.Uniform(0.5, 1.0)}
+    given = {**cal.priors.box_prior(ventricle), "pressure": dist.Uniform(0.5, 1.0)}
     states, prior = load_states(ventricle, ("low", "high"), given)
     assert states.unknowns[-2:] == ("pressure@low", "pressure@high")
     assert prior["pressure@low"] is prior["pressure@high"] is given["pressure"]
@@ -42,7 +42,7 @@ def test_what_a_prior_does_not_name_has_the_box_and_a_state_goes_before_all(vent
     assert states.unknowns == (*MATERIAL, "pressure@low")
     assert prior["a"] is given["a"]
     assert prior["pressure@low"] is given["pressure"]
-    box = cal.box_prior(ventricle)["b"]
+    box = cal.priors.box_prior(ventricle)["b"]
     assert float(prior["b"].icdf(0.3)) == float(box.icdf(0.3))
     # And a prior of one state before a value known in every other.
     given = {"pressure@low": dist.Uniform(0.6, 1.0)}

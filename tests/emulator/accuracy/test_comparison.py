@@ -24,7 +24,7 @@ def test_errors_by_hand():
     np.testing.assert_allclose(errors["err_I1"], I1(G) - I1(H), rtol=1e-10)
     E = lambda h: 0.5 * (h + h.T + h.T @ h)  # F = I + h, and E = (F'F - I) / 2
     np.testing.assert_allclose(errors["err_E"], np.abs(E(G) - E(H)).max(), rtol=1e-10)
-    Pi = em.potential_energy(scene)
+    Pi = em.fem.potential_energy(scene)
     a, b = Pi(u, scene.centre), Pi(reference, scene.centre)
     assert errors["err_Pi"] == pytest.approx(100 * abs(float(a / b - 1)))
 

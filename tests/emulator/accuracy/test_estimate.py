@@ -53,7 +53,7 @@ def far(field, error):
 
 
 def test_wrong_by_a_term_proportional_to_the_error(beam, bar, exact, off):
-    Pi = em.potential_energy(beam)
+    Pi = em.fem.potential_energy(beam)
     field, energy = [], []
     for size in (0.1, 0.05):
         error = off(size).error
@@ -111,7 +111,7 @@ def test_where_one_step_is_wild_the_bar_is_not(beam, one_step, bar, exact, wild,
     assert estimate.iterations > 0
     assert estimate.valid
     assert far(estimate.field, error) < 0.1
-    Pi = em.potential_energy(beam)
+    Pi = em.fem.potential_energy(beam)
     gap = Pi(u, beam.centre) - Pi(exact, beam.centre)
     assert estimate.energy_gap == pytest.approx(float(gap), rel=0.05)
 

@@ -75,14 +75,14 @@ def test_the_residual_of_round_off_is_that_of_a_stretch_by_round_off(scene, requ
     system, X = em.Simulator(scene).system, jnp.asarray(scene.mesh.nodes)
     internal = lambda u: system.internal_force(u, scene.centre)
     _, force = jax.jvp(internal, (0.0 * X,), (X,))
-    newton = LoadStepping(system, em.NewtonOptions(absolute=0.0), scene.centre)
+    newton = LoadStepping(system, em.fem.NewtonOptions(absolute=0.0), scene.centre)
     expected = 1e-15 * float(jnp.linalg.norm(force))
     assert float(newton.begin(0.0 * X).round_off.residual) == pytest.approx(expected, rel=1e-4)
 
 
 def test_one_iteration_is_a_function_of_its_state(beam):
     system = em.Simulator(beam).system
-    newton = LoadStepping(system, em.NewtonOptions(), beam.centre)
+    newton = LoadStepping(system, em.fem.NewtonOptions(), beam.centre)
     begin = newton.begin(jnp.zeros(beam.held.shape))
     one, again = newton.step(begin), newton.step(begin)
     np.testing.assert_array_equal(one.u, again.u)
@@ -144,7 +144,7 @@ def test_sensitivities_where_cholesky_is_refused(ventricle):
 
 
 def test_load_steps_follow_the_loading_path(beam):
-    whole, path = em.Simulator(beam), em.Simulator(beam, em.NewtonOptions.load_steps(5))
+    whole, path = em.Simulator(beam), em.Simulator(beam, em.fem.NewtonOptions.load_steps(5))
     one, five = whole.solve(beam.centre), path.solve(beam.centre)
     assert five.converged
     assert int(five.iterations) >= 10  # two or more a step
@@ -157,7 +157,7 @@ def test_a_soft_ventricle_ends_where_loading_leads():
     scene = em.scenes.left_ventricle(order=1)
     theta = scene.theta(a=0.316, b=1.0, a_f=3.0, b_f=1.0, pressure=1.333)
     from_rest = em.Simulator(scene).solve(theta)
-    path = em.Simulator(scene, em.NewtonOptions.load_steps(10)).solve(theta)
+    path = em.Simulator(scene, em.fem.NewtonOptions.load_steps(10)).solve(theta)
     assert from_rest.converged
     assert path.converged
     np.testing.assert_allclose(from_rest.displacement, path.displacement, atol=1e-6)
@@ -166,7 +166,7 @@ def test_a_soft_ventricle_ends_where_loading_leads():
 @pytest.mark.parametrize("steps", [0, 1000])
 def test_load_steps_out_of_range(steps):
     with pytest.raises(InputError, match=r"load (steps|increment)"):
-        em.NewtonOptions.load_steps(steps)
+        em.fem.NewtonOptions.load_steps(steps)
 
 
 def test_a_small_residual_alone_is_no_equilibrium(beam):

@@ -52,7 +52,7 @@ def test_the_soft_corner_of_the_linear_ventricle():
     """Python, jit and 40 load steps, where they differed by 1.7 to 4.3 mm."""
     scene = em.scenes.left_ventricle(order=1)
     simulator = em.Simulator(scene)
-    path = em.Simulator(scene, em.NewtonOptions.load_steps(40))
+    path = em.Simulator(scene, em.fem.NewtonOptions.load_steps(40))
     inside = jax.jit(simulator.solve)
     rng = np.random.default_rng(11)
     soft = rng.uniform(size=(60, 5)) * np.array([0.6, 0.2, 0.2, 0.2, -0.25])

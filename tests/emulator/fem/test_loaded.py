@@ -59,7 +59,7 @@ def test_the_image_has_loads_of_its_own(imaged, ventricle):
 def test_a_solve_unloads_and_loads(simulator, ventricle):
     theta = theta_of(1.2, 0.8)
     found = simulator.solve(theta).require_converged()
-    unloaded = em.unload(ventricle, image_theta(simulator.scene, theta)[:5])
+    unloaded = em.fem.unload(ventricle, image_theta(simulator.scene, theta)[:5])
     loaded = em.Simulator(unloaded.scene).solve(theta[:5])
     by_hand = unloaded.displacement + loaded.displacement
     np.testing.assert_allclose(found.displacement, by_hand, atol=1e-10)
@@ -71,7 +71,7 @@ def test_a_solve_unloads_and_loads(simulator, ventricle):
 @pytest.mark.slow
 def test_at_the_pressure_of_the_image_nothing_moves(simulator, imaged):
     theta = theta_of(0.8, 0.8)
-    at_rest = LoadedEquilibrium(imaged, em.NewtonOptions()).unloaded(theta)
+    at_rest = LoadedEquilibrium(imaged, em.fem.NewtonOptions()).unloaded(theta)
     still = simulator.solve(theta, at_rest.displacement).require_converged()
     assert float(jnp.abs(still.displacement).max()) < 1e-8
     assert int(still.iterations) > int(at_rest.iterations)  # loaded from rest
@@ -111,7 +111,7 @@ def test_derivatives_follow_by_the_chain_rule(dilatation):
 
 @pytest.mark.slow
 def test_a_campaign_and_emulators(simulator, imaged, tmp_path):
-    runs = em.run_campaign(simulator, design(imaged, 20, 0), sensitivities=True)
+    runs = em.fem.run_campaign(simulator, design(imaged, 20, 0), sensitivities=True)
     assert np.isnan(runs.energy).all()
     reduced = em.fit_reduced(imaged, runs)
     at_a_run = reduced(runs.theta[3])
@@ -128,8 +128,8 @@ def test_a_campaign_and_emulators(simulator, imaged, tmp_path):
 
 def test_threads_share_the_recent_shapes(imaged, monkeypatch):
     solves = []
-    monkeypatch.setattr(em.Unloader, "solve", lambda _, theta: solves.append(theta) or theta)
-    loaded = LoadedEquilibrium(imaged, em.NewtonOptions())
+    monkeypatch.setattr(em.fem.Unloader, "solve", lambda _, theta: solves.append(theta) or theta)
+    loaded = LoadedEquilibrium(imaged, em.fem.NewtonOptions())
     thetas = [theta_of(1.0, 0.3 + 0.01 * k) for k in range(40)]
     with ThreadPoolExecutor(8) as pool:
         shapes = list(pool.map(loaded.unloaded, thetas))
@@ -151,9 +151,9 @@ def test_a_failure_to_unload_is_that_of_the_solve(simulator):
 
 NEEDING_REST = [
     lambda scene: em.Simulator(scene).system,
-    lambda scene: em.potential_energy(scene),
-    lambda scene: em.unload(scene, theta_of(1.0, 0.8)),
-    lambda scene: em.element_fields(scene, np.zeros(scene.held.shape), theta_of(1.0, 0.8)),
+    lambda scene: em.fem.potential_energy(scene),
+    lambda scene: em.fem.unload(scene, theta_of(1.0, 0.8)),
+    lambda scene: em.fem.element_fields(scene, np.zeros(scene.held.shape), theta_of(1.0, 0.8)),
     lambda scene: em.Simulator(scene).reactions(np.zeros(scene.held.shape), theta_of(1.0, 0.8)),
     lambda scene: em.train(scene, em.recipe("physics"), "nowhere"),
     lambda scene: em.train(scene, em.recipe("sweeps"), "nowhere"),

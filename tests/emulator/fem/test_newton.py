@@ -26,7 +26,7 @@ def test_conditions_of_loops_read_flags_only(name, request):
     """Under vmap a condition that evaluates the potential hung on a ventricle."""
     scene = request.getfixturevalue(name)
     system = em.Simulator(scene).system
-    solve = lambda theta, start: find_equilibrium(system, em.NewtonOptions(), theta, start)
+    solve = lambda theta, start: find_equilibrium(system, em.fem.NewtonOptions(), theta, start)
     arguments = scene.centre, jnp.zeros(scene.held.shape)
     found = list(conditions(jax.make_jaxpr(solve)(*arguments).jaxpr))
     assert len(found) >= 3  # the iteration and two of the line search

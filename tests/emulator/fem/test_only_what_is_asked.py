@@ -38,7 +38,7 @@ def operations(jaxpr) -> Counter:
 
 def cost(scene):
     """Operations of the energy's value and gradient, and what the compiler makes of them."""
-    function = jax.value_and_grad(em.potential_energy(scene))
+    function = jax.value_and_grad(em.fem.potential_energy(scene))
     arguments = (jnp.zeros(scene.held.shape), scene.centre)
     flops = jax.jit(function).lower(*arguments).compile().cost_analysis()["flops"]
     return operations(jax.make_jaxpr(function)(*arguments).jaxpr), flops

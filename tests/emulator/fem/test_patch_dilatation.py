@@ -124,7 +124,7 @@ def test_residual_and_tangent_are_derivatives_of_the_energy(name, request):
     system, theta = System(scene), scene.centre
     u = some_displacement(scene)
     v = system.extend(jnp.asarray(np.random.default_rng(2).normal(size=len(system.free))))
-    slope = jax.grad(em.potential_energy(scene))
+    slope = jax.grad(em.fem.potential_energy(scene))
 
     @jax.jit
     def derivatives(u, v):

@@ -51,7 +51,7 @@ def test_a_hanging_block_carries_its_weight():
 @pytest.mark.optimised
 def test_the_solution_minimises_the_energy(beam, simulator):
     u = simulator(beam.centre)
-    Pi = em.potential_energy(beam)
+    Pi = em.fem.potential_energy(beam)
     rng = np.random.default_rng(0)
     for _ in range(5):
         v = jnp.where(beam.held, 0.0, 1e-3 * rng.normal(size=u.shape))
@@ -104,7 +104,7 @@ def test_taylor_remainder_in_theta(beam, simulator):
 def test_vmap_equals_one_at_a_time(beam, simulator):
     thetas = beam.from_unit(jnp.asarray(np.random.default_rng(0).uniform(size=(4, 2))))
     together = jax.vmap(simulator.solve)(thetas)
-    assert (together.status == em.Status.CONVERGED).all()
+    assert (together.status == em.fem.Status.CONVERGED).all()
     for theta, u in zip(thetas, together.displacement, strict=True):
         np.testing.assert_allclose(simulator(theta), u, atol=1e-7)
     pulled = jax.vmap(jax.grad(lambda t: jnp.sum(simulator.solve(t).displacement)))(thetas)
@@ -145,7 +145,7 @@ def test_prescribed_displacements_are_met_exactly(cube):
 @pytest.mark.optimised
 def test_a_heavy_load_is_taken_in_steps():
     scene = em.scenes.twisting_cube(cells=4, degrees=170.0, order=1)
-    one = em.Simulator(scene, em.NewtonOptions(level_iterations=7))
+    one = em.Simulator(scene, em.fem.NewtonOptions(level_iterations=7))
     solution = one.solve(scene.theta(E=5.0, nu=0.4))
     assert solution.converged
     assert solution.iterations > 7  # the first attempt, the whole load at once, was given up
@@ -154,12 +154,12 @@ def test_a_heavy_load_is_taken_in_steps():
 
 def test_failures_have_names(beam, simulator):
     bad = simulator.solve(jnp.array([jnp.nan, 60.0]))
-    assert bad.status == em.Status.INVALID_INPUT
+    assert bad.status == em.fem.Status.INVALID_INPUT
     assert np.isfinite(bad.displacement).all()
     with pytest.raises(SolverError, match="theta or the starting displacement is not finite"):
         simulator(jnp.array([jnp.nan, 60.0]))
-    short = em.Simulator(beam, em.NewtonOptions(max_iterations=2)).solve(beam.centre)
-    assert short.status == em.Status.ITERATION_LIMIT
+    short = em.Simulator(beam, em.fem.NewtonOptions(max_iterations=2)).solve(beam.centre)
+    assert short.status == em.fem.Status.ITERATION_LIMIT
     assert np.isfinite(short.displacement).all()
     with pytest.raises(SolverError, match=r"iteration limit reached \(converged up to 0 % of it\)"):
         short.require_converged()
@@ -187,7 +187,7 @@ def test_an_impossible_load_ends_in_a_named_failure():
     scene = block(cells=(2, 2, 2))
     scene = replace(scene, supports=(Support("left"), Support("right", np.array([-2.5, 0.0, 0.0]))))
     solution = em.Simulator(scene).solve(scene.centre)
-    assert solution.status == em.Status.INVERTED_ELEMENT
+    assert solution.status == em.fem.Status.INVERTED_ELEMENT
     assert 0.0 < solution.load_reached < 1.0
     assert np.isfinite(solution.displacement).all()
     with pytest.raises(SolverError, match=r"an element would invert.*converged up to \d"):
@@ -211,7 +211,7 @@ def test_a_body_at_rest_without_loads():
 def test_a_singular_tangent_has_a_name():
     scene = block(loads=(Gravity(),))
     solution = em.Simulator(scene).solve(jnp.array([0.0, 0.0]))  # no stiffness at all
-    assert solution.status == em.Status.SINGULAR_TANGENT
+    assert solution.status == em.fem.Status.SINGULAR_TANGENT
     with pytest.raises(SolverError, match="singular tangent"):
         solution.require_converged()
 
@@ -221,7 +221,7 @@ def test_a_singular_tangent_does_not_raise_inside_jit(theta):
     scene = block(loads=(Gravity(),))
     simulator = em.Simulator(scene)
     solution = jax.jit(simulator.solve)(jnp.array(theta))
-    assert solution.status == em.Status.SINGULAR_TANGENT
+    assert solution.status == em.fem.Status.SINGULAR_TANGENT
     assert np.isfinite(solution.displacement).all()
 
 

@@ -137,7 +137,7 @@ def test_a_part_that_overflows_leaves_the_others_alone():
 @pytest.mark.parametrize("name", ["traction_beam", "ventricle"])
 def test_it_ends_where_newton_does(name, request):
     scene = request.getfixturevalue(name)
-    theta, options = scene.centre, em.NewtonOptions(stress_iterates=False)
+    theta, options = scene.centre, em.fem.NewtonOptions(stress_iterates=False)
     one, other = em.Simulator(scene).solve(theta), em.Simulator(scene, options).solve(theta)
     assert one.converged
     assert other.converged

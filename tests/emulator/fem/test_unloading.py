@@ -43,7 +43,7 @@ def missed(unloaded, theta):
 
 @pytest.fixture(scope="module")
 def unloader(ventricle):
-    return em.Unloader(ventricle)
+    return em.fem.Unloader(ventricle)
 
 
 def test_the_unloaded_shape_loaded_from_rest_is_the_mesh(unloader, ventricle):
@@ -67,7 +67,7 @@ def test_a_body_loaded_and_unloaded_is_itself(ventricle, unloader):
     fibres = np.asarray(along / jnp.linalg.norm(along, axis=-1, keepdims=True))
     mesh = replace(ventricle.mesh, nodes=ventricle.mesh.nodes + np.asarray(u))
     image = replace(ventricle, mesh=mesh, fibres=fibres, fibre_rule=None, origin={})
-    unloaded = em.unload(image, theta).require_converged()
+    unloaded = em.fem.unload(image, theta).require_converged()
     np.testing.assert_allclose(unloaded.displacement, -u, atol=MET)
     np.testing.assert_allclose(unloaded.scene.fibres, ventricle.fibres, atol=1e-9)
 
@@ -79,7 +79,7 @@ def test_a_body_loaded_and_unloaded_is_itself(ventricle, unloader):
 def test_so_it_is_at_any_theta(order, dilatation):
     scene = em.scenes.left_ventricle(4, 8, 1, order=order)
     scene = replace(scene, dilatation=dilatation, origin={})
-    unloader = em.Unloader(scene)
+    unloader = em.fem.Unloader(scene)
     for theta in some_theta(scene, 5, seed=4):
         assert missed(unloader.solve(theta), theta) < MET
 
@@ -87,7 +87,7 @@ def test_so_it_is_at_any_theta(order, dilatation):
 @pytest.mark.slow
 def test_so_it_is_on_the_default_ventricle():
     scene = em.scenes.left_ventricle()
-    unloader = em.Unloader(scene)
+    unloader = em.fem.Unloader(scene)
     for theta in some_theta(scene, 3):
         assert missed(unloader.solve(theta), theta) < MET
 
@@ -96,7 +96,7 @@ def test_so_it_is_on_the_default_ventricle():
 @pytest.mark.parametrize(("order", "dilatation"), [(1, "pointwise"), (2, "mean")])
 def test_the_fixed_point_is_the_shape_of_inverse_motion(order, dilatation):
     scene = replace(em.scenes.left_ventricle(4, 8, 1, order=order), dilatation=dilatation)
-    one, other = (em.Unloader(scene, method) for method in ("inverse", "fixed_point"))
+    one, other = (em.fem.Unloader(scene, method) for method in ("inverse", "fixed_point"))
     found = one.solve(scene.centre).require_converged()
     again = other.solve(scene.centre).require_converged()
     np.testing.assert_allclose(found.displacement, again.displacement, atol=1e-6)
@@ -107,7 +107,7 @@ def test_the_fixed_point_is_the_shape_of_inverse_motion(order, dilatation):
 @pytest.mark.slow
 def test_a_liver_on_springs_is_unloaded_from_its_weight():
     scene = em.scenes.liver(shells=2)
-    assert missed(em.unload(scene, scene.centre), scene.centre) < MET
+    assert missed(em.fem.unload(scene, scene.centre), scene.centre) < MET
 
 
 @pytest.mark.slow
@@ -118,7 +118,7 @@ def test_a_sphere_is_unloaded_by_its_radial_integral():
     outer = (OUTER**3 + inner**3 - INNER**3) ** (1.0 / 3.0)
     scene = replace(sphere_scene(cells), mesh=sphere_octant(inner, outer, cells, 1.5, order=2))
     theta = jnp.array([MU, bulk_modulus(MU, 0.4999), pressure_at(stretch)])
-    mesh = em.unload(scene, theta).scene.mesh
+    mesh = em.fem.unload(scene, theta).scene.mesh
     for name, radius in (("inner", INNER), ("outer", OUTER)):
         found = np.linalg.norm(mesh.nodes[mesh.node_set(name)], axis=1)
         assert found.mean() == pytest.approx(radius, rel=0.005)
@@ -160,7 +160,7 @@ def test_derivatives_with_mean_dilatation_and_of_the_fixed_point():
     scene = replace(em.scenes.left_ventricle(4, 8, 1), dilatation="mean", origin={})
     theta = scene.centre
     for method, close in (("inverse", 1e-6), ("fixed_point", 1e-4)):
-        unloader = em.Unloader(scene, method)
+        unloader = em.fem.Unloader(scene, method)
         way = lambda theta: unloader.solve(theta).displacement  # noqa: B023
         difference, size = differences(way, theta, PART * theta)
         along = jax.jvp(way, (theta,), (PART * theta,))[1]
@@ -227,17 +227,17 @@ def test_how_much_of_a_load_that_is_too_high_could_be_taken_off(tmp_path, capsys
     line = f"up to {share:.3g} % of the load (pressure {amount:.3g} kPa) could be taken off"
     assert capsys.readouterr().out.splitlines()[1] == line
     scene = em.find_scene(str(tmp_path / "lv.toml"))
-    most = em.unload(scene, scene.theta(mu=1.0, pressure=150.0))
+    most = em.fem.unload(scene, scene.theta(mu=1.0, pressure=150.0))
     with pytest.raises(SolverError, match=re.escape(line)):
         most.require_converged()
-    assert em.unload(scene, jnp.array([1.0, amount])).converged
+    assert em.fem.unload(scene, jnp.array([1.0, amount])).converged
 
 
 @pytest.mark.slow
 def test_corners_may_invert_where_no_mesh_is_asked_for():
     """Corners of flat elements turn over long before the points at which stress is evaluated."""
     scene, theta = em.scenes.left_ventricle(4, 8, 1), jnp.array([0.2, 1.0, 3.0, 1.0, 100.0])
-    most = em.unload(scene, theta)
+    most = em.fem.unload(scene, theta)
     assert most.converged
     assert volume_ratio(scene, most.displacement).min() > 0.1
     with pytest.raises(InputError, match="28 of 156 elements of the stress-free mesh are inverted"):
@@ -258,11 +258,11 @@ REFUSED = [
 @pytest.mark.parametrize(("scene", "fault"), REFUSED)
 def test_what_is_refused_says_why(scene, fault):
     with pytest.raises(InputError, match=f"scene 'block.*': .*{fault}"):
-        em.Unloader(scene)
+        em.fem.Unloader(scene)
 
 
 def test_a_method_and_a_theta_that_are_not_there(ventricle, unloader):
     with pytest.raises(InputError, match="method of unloading 'luck' is unknown; known: inverse"):
-        em.unload(ventricle, ventricle.centre, method="luck")
+        em.fem.unload(ventricle, ventricle.centre, method="luck")
     with pytest.raises(InputError, match=r"theta has shape \(3,\); expected \(5,\)"):
         unloader.solve(jnp.zeros(3))

@@ -31,10 +31,10 @@ def test_the_unloaded_shape_loaded_from_rest_is_the_mesh(transverse):
     """The force on the loaded shape and the potential from rest are two ways to one stress."""
     scene = contracting(transverse)
     theta = at(scene, pressure=1.0, tension=TENSION)
-    unloaded = em.unload(scene, theta).require_converged()
+    unloaded = em.fem.unload(scene, theta).require_converged()
     again = em.Simulator(unloaded.scene).solve(theta).require_converged()
     np.testing.assert_allclose(again.displacement, unloaded.start, atol=MET)
-    passive = em.unload(scene, at(scene, pressure=1.0, tension=0.0)).require_converged()
+    passive = em.fem.unload(scene, at(scene, pressure=1.0, tension=0.0)).require_converged()
     assert float(jnp.abs(passive.displacement - unloaded.displacement).max()) > 0.1
 
 
@@ -50,7 +50,7 @@ def test_a_heart_imaged_at_rest_contracts():
     theta = at(scene, pressure=1.3, tension=TENSION)
     simulator = em.Simulator(scene)
     found = simulator.solve(theta).require_converged()
-    unloaded = em.unload(plain, at(plain, pressure=0.8, tension=0.0)).require_converged()
+    unloaded = em.fem.unload(plain, at(plain, pressure=0.8, tension=0.0)).require_converged()
     by_hand = em.Simulator(unloaded.scene).solve(at(plain, pressure=1.3, tension=TENSION))
     right = unloaded.displacement + by_hand.require_converged().displacement
     np.testing.assert_allclose(found.displacement, right, atol=MET)

@@ -66,14 +66,14 @@ def test_the_law_without_sheets_is_a_limit_of_it(ventricle):
         sheets=None,
     )
     u = 0.3 * jnp.asarray(np.random.default_rng(0).normal(size=ventricle.held.shape))
-    expected = em.potential_energy(without)(u, without.centre)
-    with_weak = em.potential_energy(replace(ventricle, constants=weak))
+    expected = em.fem.potential_energy(without)(u, without.centre)
+    with_weak = em.fem.potential_energy(replace(ventricle, constants=weak))
     assert with_weak(u, ventricle.centre) == pytest.approx(float(expected), rel=1e-9)
 
 
 def test_a_scene_without_sheets_does_not_pay_for_them(ventricle):
     def operations(scene):
-        energy = em.potential_energy(scene)
+        energy = em.fem.potential_energy(scene)
         return len(jax.make_jaxpr(energy)(jnp.zeros(scene.held.shape), scene.centre).jaxpr.eqns)
 
     plain = {name: PIG[name] for name in ("a", "b", "a_f", "b_f")}

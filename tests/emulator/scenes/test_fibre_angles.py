@@ -110,14 +110,14 @@ def test_sheet_angles_turn_sheets_about_the_fibres():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solver", [em.Simulator, em.Unloader])
+@pytest.mark.parametrize("solver", [em.Simulator, em.fem.Unloader])
 def test_slopes_in_sheet_angles_are_those_of_differences(solver):
     rule = Helix((60.0, -60.0), sheet_angles=("s_in", "s_out"))
     scene = orthotropic(rule, "s_in", "s_out")
     solves = solver(scene)
     theta = scene.theta(**KNOWN, s_in=30.0, s_out=-20.0)
     u = solves.solve(theta).require_converged()
-    point = u if solver is em.Unloader else u.displacement
+    point = u if solver is em.fem.Unloader else u.displacement
     slopes = solves.sensitivities(point, theta)
     for name in ("s_in", "s_out"):
         k = scene.parameter_names.index(name)

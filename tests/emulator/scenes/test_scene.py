@@ -222,8 +222,8 @@ def test_constants_take_the_place_of_parameters():
     scene = replace(block(), parameters=block().parameters[:1], constants={"lam": 4.0})
     whole = block()
     u = 0.01 * jnp.asarray(np.random.default_rng(0).normal(size=scene.held.shape))
-    assert em.potential_energy(scene)(u, jnp.array([3.0])) == pytest.approx(
-        float(em.potential_energy(whole)(u, jnp.array([3.0, 4.0])))
+    assert em.fem.potential_energy(scene)(u, jnp.array([3.0])) == pytest.approx(
+        float(em.fem.potential_energy(whole)(u, jnp.array([3.0, 4.0])))
     )
 
 

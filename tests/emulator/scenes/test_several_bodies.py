@@ -78,7 +78,7 @@ def alone():
 
 
 def test_each_body_has_its_own_solution(bodies, scene):
-    tight = em.NewtonOptions(tolerance=1e-13)
+    tight = em.fem.NewtonOptions(tolerance=1e-13)
     both = em.Simulator(scene, tight).solve(scene.centre)
     assert both.converged
     for name, own in alone().items():

@@ -177,7 +177,7 @@ def test_grips_do_not_pull():
 def test_a_tube_is_not_pulled(tmp_path):
     (tmp_path / "table.csv").write_text("outer_radius,stretch_axial,applied_y\n5.5,1.3,2.0\n")
     with pytest.raises(InputError, match="column 'applied_y': a tube is stretched and inflated"):
-        read_states(tmp_path / "table.csv", em.Tube(4.6, (0.9,)))
+        read_states(tmp_path / "table.csv", em.specimens.Tube(4.6, (0.9,)))
 
 
 SCENE = """

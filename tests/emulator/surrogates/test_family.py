@@ -10,8 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from studies.any_ventricle import training as ventricles
-from studies.any_ventricle.training import PLAN, BodyRuns, family_of, train_family
 
 import emulator as em
 from emulator.core.checkpoint import Checkpoint
@@ -35,7 +33,9 @@ from emulator.surrogates.network.family import FamilyNetwork
 from emulator.surrogates.network.graph import AugmentedGraph
 from emulator.surrogates.network.pignn import Architecture, Processor
 from emulator.surrogates.taylor import constant
+from emulator.training import families as ventricles
 from emulator.training import recipe, train
+from emulator.training.families import BodyRuns, FamilyPlan, family_of, train_family
 from emulator.training.job import Job
 from emulator.training.mechanics import Mechanics, prepare
 
@@ -109,7 +109,7 @@ def bodies() -> list[BodyRuns]:
 @pytest.fixture(scope="module")
 def family(folder: Path, bodies: list[BodyRuns]) -> Emulator:
     home = body(**SHAPES[0])
-    plan = replace(PLAN, steps=150, learning_rate=3e-3)
+    plan = replace(FamilyPlan(), steps=150, learning_rate=3e-3)
     return train_family(family_of(bodies, home, SMALL), "made up", plan, folder, home)
 
 
@@ -301,7 +301,7 @@ def test_a_resumed_training_is_the_uninterrupted_one(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    home, plan = family.scene, replace(PLAN, steps=150, learning_rate=3e-3)
+    home, plan = family.scene, replace(FamilyPlan(), steps=150, learning_rate=3e-3)
     monkeypatch.setattr(Checkpoint, "keep", Checkpoint.write)
 
     def killed(state: object, _: int) -> None:
@@ -310,7 +310,7 @@ def test_a_resumed_training_is_the_uninterrupted_one(
 
     made = family_of(bodies, home, SMALL)
     with pytest.raises(KeyboardInterrupt):
-        train_family(made, "made up", plan, tmp_path, home, told=killed)
+        train_family(made, "made up", plan, tmp_path, home, after_step=killed)
     again = train_family(made, "made up", plan, tmp_path, home, resume=True)
     assert np.array_equal(again.cache()(home.centre), family.cache()(home.centre))
     with pytest.raises(InputError, match="another run: its bodies is made up, not others"):
@@ -333,7 +333,7 @@ def test_a_start_for_other_recipes(family: Emulator, tmp_path: Path) -> None:
     # Resumed, it is asked for again: the checkpoint of a training without a network has no weights.
     whole = train(scene, plan, tmp_path, start=family)
     with pytest.raises(InputError, match="stands on another emulator than is given"):
-        train(scene, PLAN, tmp_path, resume=True)
+        train(scene, FamilyPlan(), tmp_path, resume=True)
     again = train(scene, plan, tmp_path, start=family, resume=True)
     assert again.fingerprint == whole.fingerprint
 

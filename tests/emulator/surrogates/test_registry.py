@@ -81,7 +81,7 @@ def test_every_kind_builds_a_map_with_its_name_and_its_own_fingerprint():
     for name in ("emulator", "corrected", "fem"):
         again = build_forward(name, Ingredients(scene, em.Simulator(scene)))
         assert again.fingerprint == maps[name].fingerprint
-    loose = em.Simulator(scene, em.NewtonOptions(tolerance=1e-6))
+    loose = em.Simulator(scene, em.fem.NewtonOptions(tolerance=1e-6))
     assert build_forward("fem", Ingredients(scene, loose)).fingerprint != maps["fem"].fingerprint
     assert not maps["emulator"].evaluate(1.5 * scene.centre).valid
 

@@ -198,7 +198,7 @@ def test_refusals(simulator, monkeypatch):
             expand_at(simulator, simulator.rest, scene.centre, order)
     with pytest.raises(InputError, match=r"theta has shape \(1,\); expected \(2,\)"):
         expand(simulator, scene.centre[:1])
-    brief = replace(simulator, options=em.NewtonOptions(max_iterations=1))
+    brief = replace(simulator, options=em.fem.NewtonOptions(max_iterations=1))
     with pytest.raises(SolverError, match="the expansion's centre: "):
         expand(brief)
     u = simulator(scene.centre)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import emulator as em
-from emulator.core.errors import InputError
+from emulator.core.errors import InputError, SolverError
 from emulator.fem.campaign.designs import uniform
 from emulator.geometry.refinement import to_quadratic
 from emulator.surrogates import Architecture
-from emulator.training import recipe, train
+from emulator.training import paper, recipe, train
 from emulator.training.job import Job
 from emulator.training.optimiser import with_weights
 from emulator.training.paper import Paper, prepare
@@ -37,7 +37,7 @@ def test_a_step_descends_the_mean_energy(beam, simulator):
     """Its loss and its slope along a direction of all weights, by the scene's energy itself."""
     problem = prepare(Paper(batch=4, seed=3), Job(beam, SMALL))
     thetas = uniform(beam, 4, jax.random.fold_in(jax.random.key(3), 7))
-    Pi = em.potential_energy(beam)
+    Pi = em.fem.potential_energy(beam)
     centre = Pi(simulator(beam.centre), beam.centre)
 
     def mean_energy(weights):
@@ -72,9 +72,37 @@ def test_training_lowers_the_error_and_the_energy(tmp_path):
     emulator = train(scene, plan, tmp_path, architecture=SMALL)
     assert emulator.network.graph.real == len(scene.mesh.nodes)
     thetas = uniform(scene, 8, jax.random.key(1))
-    Pi = jax.vmap(em.potential_energy(scene))
+    Pi = jax.vmap(em.fem.potential_energy(scene))
     predicted = emulator.cache()(thetas)
     assert float(Pi(predicted, thetas).mean()) < 0.0  # of rest
     exact = jnp.stack([em.Simulator(scene)(theta) for theta in thetas])
     left = jnp.linalg.norm(predicted - exact, axis=-1).mean()
     assert left < 0.8 * jnp.linalg.norm(exact, axis=-1).mean()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("rate", "exponent"), [(1e-3, 1.0), (1.0, 1.0), (1e-3, 10.0)])
+def test_training_without_barriers_ends_honestly(rate, exponent, tmp_path, monkeypatch):
+    """In a named error, or in a poor network whose error bar is right (Eq. 21 to 23 are left out)."""
+    monkeypatch.setattr(paper, "Barriers", lambda: None)
+    scene = em.scenes.left_ventricle(4, 8, 1, order=1)
+    stiffer = tuple(
+        replace(p, low=exponent * p.low, high=exponent * p.high) if p.name in ("b", "b_f") else p
+        for p in scene.parameters
+    )
+    scene = replace(scene, parameters=stiffer, origin={})
+    plan = Paper(steps=60, learning_rate=rate)
+    if rate == 1.0:
+        with pytest.raises(SolverError, match="lower the learning rate"):
+            train(scene, plan, tmp_path)
+        return
+    emulator = train(scene, plan, tmp_path)
+    forward, simulator = emulator.cache(), em.Simulator(scene)
+    bar = em.ErrorBar(forward, simulator)
+    for theta in em.fem.sobol(scene, 4, 11):
+        away = np.asarray(forward(theta) - simulator(theta))
+        estimate = bar(theta)
+        assert np.isfinite(away).all()
+        if estimate.valid:
+            true = np.median(np.linalg.norm(away, axis=1))
+            assert 1.0 / 3.0 < float(estimate.median) / true < 3.0

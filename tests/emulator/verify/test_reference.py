@@ -48,7 +48,7 @@ def released(hanging, simulator, tmp_path_factory):
     np.save(geometry / "interior-points.npy", ~hanging.held.any(axis=1))
     lam_mu = np.array([[4.0, 9.0], [8.0, 5.0]])
     np.save(test / "theta.npy", lam_mu * 1e4)
-    Pi = jax.jit(em.potential_energy(hanging))
+    Pi = jax.jit(em.fem.potential_energy(hanging))
     energy = [float(Pi(simulator(t), t)) for t in jnp.asarray(lam_mu[:, ::-1])]
     np.save(test / "pe-values.npy", np.array(energy) * 10.0)  # 1 mN mm = 10 erg
     return root / "Liver"

@@ -43,7 +43,7 @@ def _sbc(arguments: Namespace) -> Answer:
     """Calibrate many synthetic data sets, and count how often intervals cover the truth."""
     from calibrate.analysis.sbc import sbc
     from calibrate.cli.run_words import noise_words, problem_of
-    from calibrate.figures.sensitivity import draw_calibration
+    from calibrate.figures.sensitivity import calibration_figure
     from calibrate.posterior.predictions import shortfall
     from calibrate.project import by_fem, model_before_data
     from calibrate.samplers import AutoOptions
@@ -67,7 +67,7 @@ def _sbc(arguments: Namespace) -> Answer:
     )
     result = calibration.to_json()
     write_json(folder / "calibration.json", result)
-    draw_calibration(calibration, f"{run.scene}, {run.forward}", folder / "calibration.png")
+    calibration_figure(calibration, f"{run.scene}, {run.forward}", folder / "calibration.png")
     rows = [
         (name, *(f"{100 * share[0]:.0f}" for share in levels.values()), calibration.outside()[name])
         for name, levels in calibration.coverage().items()

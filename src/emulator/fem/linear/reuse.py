@@ -21,7 +21,7 @@ from emulator.fem.linear.suitesparse import Outcome, Solved, factor_and_solve, k
 TOLERANCE = 1e-10  # relative residual, in the norm of the inverse factorised tangent
 _PATIENCE = 6  # iterations before conjugate gradients that converge too slowly are given up
 # Unknowns from which conjugate gradients beside a factor beat a factorisation by CHOLMOD, and the
-# iterations that then take as long. Times grow as n^2 and n^(4/3) (studies/large_meshes).
+# iterations that then take as long. Times grow as n^2 and n^(4/3) (docs/experiments.md).
 _LARGE = 100_000
 _ITERATIONS_OF_LARGE = 25
 

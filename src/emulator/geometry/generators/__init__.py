@@ -6,6 +6,7 @@ from emulator.geometry.generators.ellipsoid import (
     HUMAN,
     EllipsoidalWall,
     human_ventricle,
+    land_ventricle,
     truncated_ellipsoid,
 )
 from emulator.geometry.generators.sphere import organ, sphere_octant
@@ -18,6 +19,7 @@ __all__ = [
     "box",
     "cooks_membrane",
     "human_ventricle",
+    "land_ventricle",
     "organ",
     "slab",
     "sphere_octant",

@@ -61,7 +61,7 @@ def stacked(vertices: int, layers: int) -> np.ndarray:
 def resolved(sizes: Mapping[int, Mapping[str, Any]], order: int, **chosen: Any) -> dict[str, Any]:
     """Return sizes by name, and ``order``, with defaults in place of None.
 
-    Quadratic elements, the default, are accurate with fewer nodes (``studies/elements``); published
+    Quadratic elements, the default, are accurate with fewer nodes; published
     models have linear ones.
 
     Parameters

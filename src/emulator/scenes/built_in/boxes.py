@@ -177,7 +177,7 @@ def _mesh(
     """Return a beam whose cells are shorter at its clamps, and its sizes by name.
 
     An edge that is clamped is a singularity. With as many nodes as even cells, cells that are
-    shorter there are a third as far from the limit (``studies/elements``).
+    shorter there are a third as far from the limit.
     """
     sizes = resolved(defaults, order, cells=cells, grading=grading)
     along = toward_ends(sizes["cells"][0], sizes["grading"], clamped)

@@ -77,7 +77,7 @@ def left_ventricle(
     wall : dimensions in mm of an :class:`~emulator.geometry.generators.ellipsoid.EllipsoidalWall`.
     thicker : by which fraction the wall is thicker at the base, and towards which angle in degrees.
     order : 2, quadratic elements with a fibre at each of their four points; 1, linear ones as
-        published, whose cavity grows by a quarter too little (``studies/elements``).
+        published, whose cavity grows by a quarter too little.
     """
     sizes = resolved(_SIZES, order, rings=rings, around=around, layers=layers, grading=grading)
     mesh = truncated_ellipsoid(EllipsoidalWall(*wall), **sizes, thicker=thicker)
