@@ -146,7 +146,7 @@ class FEMLikelihood:
             solver,
             thetas,
             numbers=numbers,
-            starts=lambda k: (*nearest(k), self._start(thetas[k])),
+            starts=lambda k: (self._start(thetas[k]), *nearest(k)),
         ):
             number, state = divmod(row.number, states)
             field = Field(row.solution.displacement, row.sensitivities)
