@@ -21,6 +21,7 @@ from calibrate.project import (
 from calibrate.statistical_model.fem_likelihood import FEMLikelihood
 from emulator.core.errors import InputError, SolverError
 from emulator.fem.campaign import workers
+from emulator.fem.solution import Status
 from emulator.scenes.built_in import BUILT_IN
 
 BEAM = "once_clamped_beam"
@@ -98,6 +99,26 @@ def test_a_search_that_was_killed_goes_on_to_the_same_posterior(folder, tmp_path
     assert len(solved) == json.loads(before.tree.attrs["rounds"])[-1]["runs"] - 18
     np.testing.assert_allclose(again.draws()["mu"], before.draws()["mu"], rtol=1e-6)
     assert not (tmp_path / "r" / "solutions.safetensors").exists()
+
+
+def test_fem_that_fails_in_a_third_of_the_prior_costs_runs_and_nothing_else(monkeypatch):
+    """Bodies softer than 50 kPa, 29 % of the prior of mu, have no equilibrium."""
+    solve = workers.Solver.__call__
+
+    def failing(solver, task):
+        row = solve(solver, task)
+        if float(task.theta[0]) < 50.0:
+            failed = row.solution._replace(status=np.asarray(Status.LOAD_LIMIT))
+            return row._replace(solution=failed)
+        return row
+
+    monkeypatch.setattr(workers.Solver, "__call__", failing)
+    posterior = infer(RUN, check_map=False)
+    rounds = json.loads(posterior.tree.attrs["rounds"])
+    assert 1 <= rounds[-1]["failed"] < rounds[-1]["runs"] / 3
+    assert rounds[-1]["missed"] < 0.1
+    mu = posterior.summary()["mu"]
+    assert abs(mu["mean"] - TRUTH["mu"]) < 3.0 * mu["sd"] < 60.0
 
 
 def test_only_a_scene_without_an_emulator_gets_rounds():
