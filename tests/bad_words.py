@@ -63,7 +63,7 @@ COMMANDS = [
     ("train liver --budget 0s --out x", "duration '0s' must be above 0"),
     (
         "train once_clamped_beam --resume --budget '' --out x",
-        "--budget has no effect with --resume",
+        "duration '': give 90s",
     ),
     ("train once_clamped_beam --recipe paper --steps -1 --out x", "steps is -1"),
     ("train once_clamped_beam --resume --steps 9 --out x", "--steps has no effect with --resume"),

@@ -189,9 +189,9 @@ def specimen() -> Journey:
 JOURNEYS: dict[str, tuple[int, Callable[[], Journey]]] = {
     "scene TOML to Scene": (18, scene_file),
     "Simulator.solve to law.energy": (12, solve),
-    "calibrate infer to the data file": (32, parse),
+    "calibrate infer to the data file": (34, parse),
     "calibrate infer to the likelihood": (80, likelihood),
-    "table of a specimen to the likelihood": (78, specimen),
+    "table of a specimen to the likelihood": (79, specimen),
     "calibrate certify to Simulator.solve": (70, check),
 }
 """Journeys by what they lead from and to, each with the most files that it may enter."""

@@ -35,6 +35,7 @@ QUICK = {
     "mesh_row": "--quick",
     "mesh_to_certificate": "--ventricles 1 --mesh 5 10 1",
     "networks_alone": "--quick",
+    "no_box": "--quick",
     "released_networks": "--quick --published PUBLISHED",
     "sbc": "--replicates 20 --only map",
     "sheep_myocardium": "--data MEASURED/ovine_myocardium --quick",

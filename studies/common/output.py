@@ -117,6 +117,7 @@ def write_json(path: Path, content: Any) -> None:
 
 def table(header: list[str], rows: list[list[str]]) -> str:
     """Return lines of columns as wide as their widest cell, the first one to the left."""
+    rows = [[str(cell) for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
     return "\n".join(
         "  ".join(cell.ljust(w) if k == 0 else cell.rjust(w)

@@ -26,7 +26,6 @@ from calibrate.state_names import in_state
 from emulator.core.cells import Cells, read_cells
 from emulator.core.errors import InputError
 from emulator.scenes.scene import Scene
-from emulator.scenes.supports import Support
 from emulator.specimens.states import falls
 
 _FOLLOWS = (
@@ -357,14 +356,7 @@ def field_doubts(
 
     parameter : what the ``amounts`` are of.
     """
-    pulling = [
-        np.atleast_2d(support.displacement)
-        for support in scene.supports
-        if isinstance(support, Support) and support.amount == parameter
-    ]
-    pulls = np.array([d[np.argmax(np.linalg.norm(d, axis=1))] for d in pulling]).reshape(-1, 3)[
-        :, :2
-    ]
+    pulls = scene.prescribed.per_unit.get(parameter, np.zeros((1, 3)))[:, :2]
     last = int(np.argmax([abs(amounts[frame]) for frame in field.frames]))
     amount, u = amounts[field.frames[last]], field.displacement[last]
     seen = np.isfinite(u).all(axis=1)

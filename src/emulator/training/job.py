@@ -90,6 +90,8 @@ class Job:
     def require_time(self, stage: str) -> None:
         """Raise :class:`InputError` where the budget is over when only ``stage`` is done."""
         if self.seconds > self.budget:
+            if self.folder is not None:
+                self.describe()
             raise InputError(
                 f"the budget of {self.budget:g} s is over after {stage}, {self.seconds:.0f} s; "
                 f"give {4.0 * self.seconds:.0f} s or more, or go on with --resume --budget TIME"

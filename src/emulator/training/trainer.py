@@ -112,7 +112,6 @@ def train(
     job = Job(scene, sizes, start, campaign, folder, as_json, limit, began, progress)
     if not resume:
         shutil.rmtree(folder, ignore_errors=True)
-    job.describe()
     plan = plan_of(identity["plan"])
     emulator = RECIPES[plan.recipe].train(plan, job)
     record = {**emulator.record, "seconds": round(job.seconds, 1)}

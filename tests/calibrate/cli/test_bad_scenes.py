@@ -59,10 +59,9 @@ def test_bad_meshes_in_scene_files(capsys, block):
     assert "physical group 7 (triangles) has no name" in complaint(capsys, "simulate", block)
 
 
-def test_a_scene_without_a_shipped_emulator_says_so(capsys, block, tmp_path):
-    line = complaint(
-        capsys, "infer", block, "--truth", "mu=7", "--observe", "all", "--out", tmp_path / "r"
-    )
+def test_a_scene_without_a_shipped_emulator_says_so(capsys, block):
+    words = ("--truth", "mu=7", "--observe", "all")
+    line = complaint(capsys, "identify", "before", block, *words)
     assert "is neither shipped nor a folder with emulator.json" in line
 
 

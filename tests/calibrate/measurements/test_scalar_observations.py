@@ -127,8 +127,8 @@ def test_noise_of_what_has_no_place_or_no_default(ventricle, beam):
 @pytest.mark.parametrize(
     ("word", "message"),
     [
-        ("length:3", "observe 'length:3': give length:A:B"),
-        ("length:3:", "give length:A:B"),
+        ("length:3", "observe 'length:3': give length:FIRST:SECOND"),
+        ("length:3:", "give length:FIRST:SECOND"),
         ("length:3:3", "both landmarks are at"),
         ("length:3:999", "node 999 is unknown"),
         ("length:3:tip", r"landmark 'tip' is neither a node, a node set \(apex_endocardium, "),

@@ -68,8 +68,14 @@ def test_columns_have_units(word, expected):
             {"stretch_x": [1.0, 1.1, 1.2], "stretch_y": [1.0, 1.1, NAN]},
             "row 3 has no stretch along y, others have",
         ),
-        ({"stretch_x": [1.0, 1.2, 1.1]}, "row 3 is nearer to rest than one before: unloading"),
-        ({"applied_x": [0.0, 2.0, 1.0]}, "row 3 is nearer to rest than one before: unloading"),
+        (
+            {"stretch_x": [1.0, 1.2, 1.1]},
+            "row 3 is nearer to rest than one before: rows of a test are in the order of its loading",
+        ),
+        (
+            {"applied_x": [0.0, 2.0, 1.0]},
+            "row 3 is nearer to rest than one before: rows of a test are in the order of its loading",
+        ),
         (
             {"applied_x [furlong]": [0.0, 2.0]},
             "column 'applied_x [furlong]': unit 'furlong' is unknown",

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import emulator as em
+from emulator.core.checkpoint import Checkpoint
 from emulator.core.errors import InputError, SolverError
 from emulator.core.store import read_arrays
 from emulator.fem import simulator as fem_simulator
@@ -154,7 +155,7 @@ def test_nonsense_gives_no_target(simulator, equilibrium, wrong):
 
 def test_killed_they_go_on_to_the_same_bits(beam, simulator, tmp_path, monkeypatch):
     whole = sweep_box(simulator, 24, 1)
-    monkeypatch.setattr(module, "_WRITE_EVERY", 0.0)
+    kept = Checkpoint(tmp_path / "sweeps.safetensors", every=0.0)
     sweep, done = module._sweep, []
 
     def kill(*arguments):
@@ -165,9 +166,9 @@ def test_killed_they_go_on_to_the_same_bits(beam, simulator, tmp_path, monkeypat
 
     monkeypatch.setattr(module, "_sweep", kill)
     with pytest.raises(KeyboardInterrupt):
-        sweep_box(simulator, 24, 1, folder=tmp_path)
+        sweep_box(simulator, 24, 1, checkpoint=kept)
     monkeypatch.setattr(module, "_sweep", sweep)
-    resumed = sweep_box(simulator, 24, 1, folder=tmp_path)
+    resumed = sweep_box(simulator, 24, 1, checkpoint=kept)
     np.testing.assert_array_equal(whole.polynomial.coefficients, resumed.polynomial.coefficients)
     assert resumed.number == 24
 

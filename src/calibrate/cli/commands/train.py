@@ -97,7 +97,9 @@ def train(arguments: Namespace) -> Answer:
             plan = replace(plan, **all_runs)
     # A plan without a network has nothing but FEM runs: all are solved unless --budget limits them.
     unlimited = arguments.resume or "steps" in entries or not plan.trains_network
-    budget = arguments.budget or (None if unlimited else "10m")
+    budget = None if unlimited else "10m"
+    if arguments.budget is not None:
+        budget = arguments.budget
     result = train_emulator(
         scene,
         plan,

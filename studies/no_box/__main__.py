@@ -1,0 +1,139 @@
+"""Does a posterior get found from a wide prior, wherever the truth is?
+
+Truths are drawn from the wide prior itself, so that half of them and more lie outside of the range
+that the scene names; FEM makes the data. ``infer`` finds the posterior by rounds of FEM runs and
+makes an emulator of them; FEM checks it with runs of its own. Counted are runs, seconds, verdicts,
+truths inside 90 % intervals, and how far FEM would move a mean.
+
+    python -m studies.no_box [--quick]
+"""
+
+import json
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from studies.common.figures import pyplot
+from studies.common.output import Case, Results, parser
+
+import calibrate as cal
+import emulator as em
+
+HERE = Path(__file__).parent
+SEED = 83
+PRESSURES = {"pressure@p5": 0.67, "pressure@p8": 1.07, "pressure@p10": 1.33}
+# Observations, noise, known parameters and number of data sets of each body.
+BODIES: dict[str, tuple[str, dict[str, float], dict[str, float], int]] = {
+    "once_clamped_beam": ("nodes:20", {"displacement": 0.2}, {}, 10),
+    "twisting_cube": ("nodes:20", {"displacement": 0.05}, {}, 10),
+    "left_ventricle": ("volume", {"volume": 1.0}, PRESSURES, 5),
+}
+
+
+def truth_of(scene: em.Scene, known: dict[str, float], number: int) -> dict[str, float]:
+    """A draw of the wide prior: log-normal, one sd or a factor of 2 to an end of the range."""
+    rng = np.random.default_rng([SEED, number])
+    drawn = {}
+    for k, parameter in enumerate(scene.parameters):
+        if any(name.startswith(f"{parameter.name}@") for name in known):
+            continue
+        if parameter.low > 0.0:
+            width = max(0.5 * np.log(parameter.high / parameter.low), np.log(2.0))
+            drawn[parameter.name] = float(scene.centre[k] * np.exp(width * rng.normal()))
+        else:
+            drawn[parameter.name] = float(rng.uniform(parameter.low, parameter.high))
+    return drawn
+
+
+def one(body: str, number: int) -> dict[str, Any]:
+    """One data set of ``body``, to its verdict."""
+    observe, noise, known, _ = BODIES[body]
+    scene = em.find_scene(body)
+    truth = truth_of(scene, known, number)
+    ranges = {p.name: (p.low, p.high) for p in scene.parameters}
+    outside = sorted(n for n, v in truth.items() if not ranges[n][0] <= v <= ranges[n][1])
+    begin = time.perf_counter()
+    words = {"truth": truth, "known": known, "noise": noise}
+    lines = [f'scene = "{body}"', f'observe = "{observe}"', 'forward = "rounds"']
+    lines += [f"seed = {SEED + number}"]
+    for entry, values in words.items():
+        lines += [f"[{entry}]", *(f'"{name}" = {value!r}' for name, value in values.items())]
+    with tempfile.TemporaryDirectory() as folder:
+        experiment = Path(folder) / "experiment.toml"
+        experiment.write_text("\n".join(lines))
+        posterior = cal.infer(cal.read_experiment(experiment), check_map=False)
+    searched = time.perf_counter() - begin
+    certificate = cal.certify(posterior, em.Simulator(posterior.model.forward.scene), mesh=0)
+    rounds = json.loads(posterior.tree.attrs["rounds"])
+    table = posterior.summary(0.9)
+    return {
+        "status": certificate.verdict,
+        "reason": certificate.reason,
+        "truth": truth,
+        "outside": outside,
+        "inside_90": {n: table[n]["low"] <= v <= table[n]["high"] for n, v in truth.items()},
+        "runs": rounds[-1]["runs"],
+        "failed": rounds[-1]["failed"],
+        "missed": rounds[-1]["missed"],
+        "certificate_runs": certificate.to_json()["draws"],
+        "largest_shift": max(abs(s) for s in certificate.shift.values()),
+        "seconds": [searched, time.perf_counter() - begin],
+    }
+
+
+def conclude(cases: list[Case]) -> dict[str, Any]:
+    """Sums over all data sets."""
+    inside = [hit for case in cases for hit in case["inside_90"].values()]
+    return {
+        "data_sets": len(cases),
+        "with_a_truth_outside": sum(bool(case["outside"]) for case in cases),
+        "accepted": sum(case["status"] == "accepted" for case in cases),
+        "inside_90": [sum(inside), len(inside)],
+        "median_runs": float(np.median([case["runs"] for case in cases])),
+        "largest_shift": max(case["largest_shift"] for case in cases),
+    }
+
+
+def draw(cases: list[Case], path: Path) -> None:
+    """Runs until FEM was foreseen, by body; filled where a truth is outside of the range."""
+    plt = pyplot()
+    figure, axes = plt.subplots(figsize=(7, 3.2), layout="constrained")
+    for row, body in enumerate(BODIES):
+        mine = [case for case in cases if case["name"].startswith(body)]
+        for k, case in enumerate(mine):
+            accepted = case["status"] == "accepted"
+            axes.plot(
+                case["runs"], row + 0.05 * (k - len(mine) / 2), "o",
+                color="tab:blue" if accepted else "tab:red",
+                mfc=None if case["outside"] else "white",
+            )  # fmt: skip
+    axes.set(
+        yticks=range(len(BODIES)), yticklabels=list(BODIES), xlabel="FEM runs of the rounds",
+        title="filled: a truth outside of the scene's range; red: not accepted",
+    )  # fmt: skip
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def main() -> None:
+    arguments = parser(__doc__, HERE).parse_args()
+    results = Results(arguments.out, SEED, again=arguments.again)
+    for body, (*_, count) in BODIES.items():
+        for number in range(1 if arguments.quick else count):
+            if arguments.quick and body == "left_ventricle":
+                continue
+            results.case(f"{body} {number}", lambda b=body, n=number: one(b, n))
+    cases = results.cases
+    summary = conclude(cases)
+    results.write(summary=summary)
+    draw(cases, arguments.out / "runs.png")
+    print(summary)
+    inside, of = summary["inside_90"]
+    assert arguments.quick or 0.8 * of <= inside
+    assert all(case["status"] != "accepted" or case["largest_shift"] < 0.25 for case in cases)
+
+
+if __name__ == "__main__":
+    main()
