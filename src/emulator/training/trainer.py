@@ -114,6 +114,7 @@ def train(
         shutil.rmtree(folder, ignore_errors=True)
     plan = plan_of(identity["plan"])
     emulator = RECIPES[plan.recipe].train(plan, job)
+    job.describe()
     record = {**emulator.record, "seconds": round(job.seconds, 1)}
     if start is not None:
         of = {"scene": start.scene.name, "scene_fingerprint": start.scene.fingerprint}
