@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from calibrate.priors.population import BOX, Population, population_called
+from emulator.scenes.finer import wider_within
 from emulator.scenes.forward_problem import ForwardProblem
 from emulator.scenes.scene import Scene, with_mesh
 
@@ -57,10 +58,14 @@ def completed(stated: Population | None, wide: Population | None) -> Population 
 
 
 def widened(scene: Scene, prior: Population) -> Scene:
-    """Return ``scene`` with ranges that hold all but 2e-4 of a prior's mass of each parameter."""
+    """Return ``scene`` with ranges that hold all but 2e-4 of a prior's mass of each parameter.
+
+    Where nature ends it, as Poisson's ratio ends at 1/2, a range ends just before.
+    """
     parameters = list(scene.parameters)
     for k, parameter in enumerate(parameters):
         if (median := prior.median.get(parameter.name)) is not None:
             step = float(np.exp(_WIDTH * prior.log_sd[parameter.name]))
-            parameters[k] = replace(parameter, low=median / step, high=median * step, scale="log")
+            wide = replace(parameter, low=median / step, high=median * step, scale="log")
+            parameters[k] = wider_within(parameter, scene.quantities[parameter.name], wide)
     return replace(scene, parameters=tuple(parameters))

@@ -107,16 +107,20 @@ def _is_made_by(rule: FibreRule, scene: Scene) -> bool:
     return fibres.shape == scene.fibres.shape and np.allclose(fibres, scene.fibres, atol=1e-9)
 
 
-def wider_within(parameter: Parameter, quantity: Quantity) -> Parameter:
+def wider_within(
+    parameter: Parameter, quantity: Quantity, wide: Parameter | None = None
+) -> Parameter:
     """Return the parameter with a wider range that keeps off the limits of its values by nature.
 
     An end near such a limit stays.
+
+    wide : the parameter with the range it would have; by default wider by half on each side.
     """
-    wide, near = parameter.wider(), _AT_LIMIT * (parameter.high - parameter.low)
+    wide, near = wide or parameter.wider(), _AT_LIMIT * (parameter.high - parameter.low)
     below, above = parameter.low - quantity.low, quantity.high - parameter.high
     stays = parameter.scale == "uniform" and below < near
     return replace(
-        parameter,
+        wide,
         low=parameter.low if stays else max(wide.low, parameter.low - _SHORT_OF * below),
         high=parameter.high if above < near else min(wide.high, parameter.high + _SHORT_OF * above),
     )

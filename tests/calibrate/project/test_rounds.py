@@ -143,6 +143,14 @@ def test_a_wide_prior_has_the_range_as_one_sd_and_keeps_what_is_stated():
     assert completed(None, None) is None
 
 
+def test_a_range_stays_off_what_nature_does_not_allow():
+    """Poisson's ratio ends at 1/2, wherever the median's multiples are."""
+    scene = em.scenes.twisting_cube()
+    space = {p.name: p for p in widened(scene, wide_prior(scene)).parameters}
+    assert 0.0 < space["nu"].low < space["nu"].high < 0.5
+    assert space["nu"].scale == "log"
+
+
 def test_a_prior_in_which_fem_fails_is_named(monkeypatch):
     monkeypatch.setattr(
         FEMLikelihood,
