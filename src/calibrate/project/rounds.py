@@ -144,7 +144,9 @@ def by_rounds(problem: Problem) -> Problem:
     """
     run, scene = problem.run, problem.scene
     named = run.forward != EMULATOR.name or run.emulator is not None
-    if named or not isinstance(scene, Scene) or scene.name in shipped():
+    if named or not isinstance(scene, Scene):
+        return problem
+    if scene.name in shipped() and scene.origin.get("scene") != "file":  # a file may have its name
         return problem
     return read_problem(replace(run, forward=ROUNDS.name), scene=scene)
 

@@ -174,9 +174,9 @@ parameters = {mu = {unit = "kPa", range = [50, 100]}, lam = {unit = "kPa", range
 def test_one_command_from_a_scene_file_and_data_to_a_verdict(tmp_path, capsys):
     """Nobody trained anything, and the truth is at three times the end of a range."""
     em.write_mesh(tmp_path / "own.vtu", em.generators.box((100.0, 10.0, 10.0), (8, 2, 2)))
-    (tmp_path / "own.toml").write_text(OWN)
+    (tmp_path / "liver.toml").write_text(OWN)  # called like a shipped emulator
     words = ["--truth", "mu=300", "lam=60", "--observe", "nodes:9", "--noise", "1"]
-    run = ["infer", str(tmp_path / "own.toml"), *words, "--draws", "500"]
+    run = ["infer", str(tmp_path / "liver.toml"), *words, "--draws", "500"]
     assert main([*run, "--out", str(tmp_path / "r"), "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["verdict"] == "accepted"
