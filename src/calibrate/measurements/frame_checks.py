@@ -5,8 +5,8 @@ a turn w and a growth g,
 
 .. math:: d \approx n \cdot (t + w \times x + g\, x) .
 
-What is left of the distances of a heart's frames is small; of a mirrored surface, or of another
-wall, it is not. A heart is held: its surfaces do not all shift or turn far.
+The distances of a heart's frames leave a small remainder; those of a mirrored surface, or of another
+wall, a large one. A heart is held: its surfaces do not all shift or turn far.
 
 **Together.** Surfaces of one frame do not cross. The wall between them keeps its volume, and the
 septum its thickness, but for what contraction changes.

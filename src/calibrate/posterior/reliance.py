@@ -24,7 +24,7 @@ LARGEST_MOVE = 0.5
 
 
 class Reliance(NamedTuple):
-    """What one parameter owes to its prior.
+    """The share of one parameter that rests on its prior.
 
     of_prior : the posterior sd of its logarithm over the prior's.
     move : the change of the mean of its logarithm, in posterior sd, if the prior's log sd doubles.

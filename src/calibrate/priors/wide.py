@@ -60,7 +60,7 @@ def completed(stated: Population | None, wide: Population | None) -> Population 
 def widened(scene: Scene, prior: Population) -> Scene:
     """Return ``scene`` with ranges that hold all but 2e-4 of a prior's mass of each parameter.
 
-    Where nature ends it, as Poisson's ratio ends at 1/2, a range ends just before.
+    A range ends just before a limit of nature, as 1/2 is of Poisson's ratio.
     """
     parameters = list(scene.parameters)
     for k, parameter in enumerate(parameters):

@@ -16,7 +16,7 @@ each parameter, and FEM is asked where it says most:
 4. **Teach.** The displacements of all runs, with their sensitivities, become an emulator of the
    whole body (:mod:`emulator.surrogates.discrepancy`).
 
-What the emulator is worth is judged by the certificate, by FEM runs of its own.
+The certificate judges the emulator, by FEM runs of its own.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from calibrate.importance.weights import normalised
 from calibrate.posterior.diagnosis import TAUGHT_AT
 from calibrate.project.problem import Problem, build_model, read_problem
 from calibrate.statistical_model import FEMLikelihood, Model
+from calibrate.statistical_model.density import density_of, in_blocks, prior_draws
 from calibrate.statistical_model.pool import Pool
 from calibrate.statistical_model.predictive import Predictive
 from emulator.core.display import counting
@@ -65,7 +66,7 @@ _NOISE_DRAWS = 256  # draws of the prior of a noise sd that is inferred
 
 @dataclass(frozen=True)
 class Round:
-    """What one round found.
+    """The outcome of one round.
 
     runs : the number of runs so far. failed : those at which FEM failed.
     missed : the root mean square by which log likelihoods at the round's draws were missed, nats;
@@ -194,9 +195,8 @@ def _are_foreseen(rounds: list[Round]) -> bool:
 
 def _noise_draws(model: Model) -> dict[str, np.ndarray]:
     """Return draws of the prior of everything that is inferred, for the size of unknown noise."""
-    keys = jax.random.split(jax.random.key(0), len(model.sampled_priors))
-    priors = zip(model.sampled_priors.items(), keys, strict=True)
-    return {name: np.asarray(p.sample(key, (_NOISE_DRAWS,))) for (name, p), key in priors}
+    density = density_of(model)
+    return in_blocks(density.constrain, prior_draws(density, jax.random.key(0), _NOISE_DRAWS))
 
 
 def _spread_over_prior(predictive: Predictive, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -223,13 +223,8 @@ def _fresh_points(
     others = rng.choice(len(pool.z), size=_CANDIDATES * (_A_ROUND - drawn), p=chances)
     scale = np.sqrt(np.cov(pool.z[others], rowvar=False).reshape(len(pool.z[0]), -1).diagonal())
     known = np.concatenate([runs.z, pool.z[rows]])
-    x = np.concatenate([known, pool.z[others]]) / np.maximum(scale, 1e-12)
-    distance = np.min(((x[len(known) :, None] - x[: len(known)]) ** 2).sum(axis=-1), axis=1)
-    taken = list[int]()
-    for _ in range(_A_ROUND - drawn):
-        taken.append(int(np.argmax(distance)))
-        step = ((x[len(known) :] - x[len(known) + taken[-1]]) ** 2).sum(axis=-1)
-        distance = np.minimum(distance, step)
+    scale = np.maximum(scale, 1e-12)
+    taken = maximin_subset(pool.z[others] / scale, _A_ROUND - drawn, known / scale)
     every = np.concatenate([rows, others[taken]])
     return pool.z[every], pool.at.corrected[every], drawn
 

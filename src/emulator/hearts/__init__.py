@@ -6,7 +6,7 @@ surfaces, :mod:`.wall`, which fills and measures what is between them, and :mod:
 :mod:`.left_wall` cuts the left ventricle's part from both, and :mod:`.sheet` makes a body from
 outlines in a plane.
 
-What it exports is listed in ``__init__.pyi`` and imported when first used.
+``__init__.pyi`` lists its exports, which are imported when first used.
 """
 
 import lazy_loader

@@ -223,16 +223,19 @@ def _warp(expansion: Expansion, parameters: int) -> Warp:
     return Warp(centre, indices, jnp.asarray(coefficients), jnp.ones(parameters + count))
 
 
-def maximin_subset(positions: np.ndarray, count: int) -> np.ndarray:
+def maximin_subset(
+    positions: np.ndarray, count: int, known: np.ndarray | None = None
+) -> np.ndarray:
     """Return the rows of at most ``count`` different ``positions`` (c, p).
 
-    From the first on, each next row is the one whose least distance from the chosen is greatest.
+    From the first on, each next row is the one whose least distance from the chosen, and from those
+    of ``known`` (n, p), is greatest.
     """
-    subset = [0]
+    subset = list[int]()
     distance = np.full(len(positions), np.inf)
-    while len(subset) < min(count, len(positions)):
-        distance = np.minimum(distance, np.sum((positions - positions[subset[-1]]) ** 2, axis=1))
-        if not distance.max() > 0.0:
-            break
+    for point in () if known is None else known:
+        distance = np.minimum(distance, np.sum((positions - point) ** 2, axis=1))
+    while len(subset) < min(count, len(positions)) and distance.max() > 0.0:
         subset.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.sum((positions - positions[subset[-1]]) ** 2, axis=1))
     return np.array(subset)

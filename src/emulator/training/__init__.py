@@ -1,6 +1,6 @@
 """Training of emulators.
 
-What it exports is listed in ``__init__.pyi`` and imported when first used.
+``__init__.pyi`` lists its exports, which are imported when first used.
 """
 
 import lazy_loader

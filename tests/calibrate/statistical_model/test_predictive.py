@@ -105,3 +105,60 @@ def test_a_gauss_newton_step_against_a_dense_solve():
     assert less == pytest.approx(gradient @ short - 0.5 * short @ curvature @ short)
     bent, _ = gauss_newton_step(gradient, -np.diag(sd**-2), sd)
     np.testing.assert_allclose(bent, sd**2 * gradient)
+
+
+def kernel_by_autodiff(x, length):
+    """The covariance of values and derivatives, by JAX's derivatives of the kernel in its text."""
+
+    def k(a, b):
+        return 1e2 * (1.0 + a @ b) + jnp.exp(-0.5 * jnp.sum((a - b) ** 2) / length**2)
+
+    def block(a, b):
+        top = jnp.concatenate([k(a, b)[None], jax.grad(k, 1)(a, b)])
+        rest = jax.jacfwd(jax.grad(k, 1), 0)(a, b).T
+        return jnp.concatenate([top[None], jnp.concatenate([jax.grad(k)(a, b)[:, None], rest], 1)])
+
+    whole = jax.vmap(lambda a: jax.vmap(lambda b: block(a, b))(x))(x)
+    return np.asarray(whole.transpose(0, 2, 1, 3).reshape(2 * [x.size + len(x)]))
+
+
+def waves(x):
+    """Two functions (n, 2) and their derivatives (n, q, 2)."""
+    a, b = x.T
+    values = np.stack([np.sin(a + 0.5 * b), np.exp(0.4 * b) * a], axis=1)
+    in_a = np.stack([np.cos(a + 0.5 * b), np.exp(0.4 * b)], axis=1)
+    in_b = np.stack([0.5 * np.cos(a + 0.5 * b), 0.4 * np.exp(0.4 * b) * a], axis=1)
+    return values, np.stack([in_a, in_b], axis=1)
+
+
+def test_derivatives_and_errors_left_out_are_those_of_the_process_solved_otherwise():
+    """The covariance by automatic differentiation; each run left out by a solve without it."""
+    x = points(12)
+    values, slopes = waves(x)
+    c = fit_correction(x, values, np.ones(2), 12, slopes=slopes)
+    at_runs = jnp.asarray((x - c.centre) / c.width)
+    observed = np.concatenate([values[:, None], slopes * c.width[:, None]], axis=1)
+    y, unit = observed.reshape(-1, 2), np.tile([1.0, *2 * [c.length**-2.0]], len(x))
+    K = kernel_by_autodiff(at_runs, c.length) + c.nugget * np.diag(unit)
+    size = len(K)
+    np.testing.assert_allclose(K @ c.inverse[:size, :size], np.eye(size), atol=1e-4)
+    ratios = []
+    for run in range(len(x)):
+        left = np.arange(size) // 3 != run
+        weights = np.linalg.solve(K[np.ix_(left, left)], K[left, 3 * run])
+        variance = K[3 * run, 3 * run] - weights @ K[left, 3 * run]
+        ratios.append(np.mean((y[3 * run] - weights @ y[left]) ** 2) / variance)
+    assert c.scale == pytest.approx(np.mean(ratios), rel=1e-3)
+
+
+def test_derivatives_say_as_much_as_many_runs():
+    x, new = points(15), points(200, 1)
+    values, slopes = waves(x)
+    some = slopes.copy()
+    some[::2] = np.nan  # of half of the runs none is known
+    error = lambda c: np.sqrt(np.mean((at(c, new) - waves(new)[0]) ** 2))
+    plain, half, whole = (
+        error(fit_correction(x, values, np.ones(2), 20, slopes=s)) for s in (None, some, slopes)
+    )
+    assert whole < 0.25 * plain
+    assert whole < half < plain
