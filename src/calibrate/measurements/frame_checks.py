@@ -5,7 +5,7 @@ a turn w and a growth g,
 
 .. math:: d \approx n \cdot (t + w \times x + g\, x) .
 
-The distances of a heart's frames leave a small remainder; those of a mirrored surface, or of another
+The distances of a heart's frames leave a small remainder; those of a mirrored surface or of another
 wall, a large one. A heart is held: its surfaces do not all shift or turn far.
 
 **Together.** Surfaces of one frame do not cross. The wall between them keeps its volume, and the
