@@ -39,13 +39,13 @@ from calibrate.importance.proposals import MOST_TEMPERED, Kernels, key_from, tem
 from calibrate.importance.weights import effective, normalised
 from calibrate.posterior import Posterior
 from calibrate.statistical_model import FEMLikelihood
-from calibrate.statistical_model.correction import Correction
 from calibrate.statistical_model.pool import Pool
 from calibrate.statistical_model.predictive import Predictive
 from emulator.core.display import Stages, counting
 from emulator.core.errors import InputError, check_arguments
 from emulator.core.machine import one_blas_thread
 from emulator.fem.solution import EquilibriumSolver
+from emulator.surrogates.correction import Correction
 
 _BEGIN, _AT_MOST = 70, 200  # FEM runs by default
 _FEWEST = 25

@@ -39,10 +39,10 @@ from calibrate.importance.proposals import key_from
 from calibrate.importance.weights import effective, normalised, pareto_shape
 from calibrate.posterior import Posterior
 from calibrate.posterior.diagnosis import Misfit, Sampling, places_of
-from calibrate.statistical_model.correction import Correction
 from calibrate.statistical_model.errors import in_noise_sd
 from calibrate.statistical_model.pool import Pool
 from calibrate.statistical_model.predictive import Predictive
+from emulator.surrogates.correction import Correction
 
 GROUPS = 25
 _DRAWS = 1000  # draws of the posterior predictive check
@@ -148,10 +148,16 @@ def evidence_of(
 def figures_of(
     posterior: Posterior, tests: Tests
 ) -> tuple[Changes, Changes, dict[str, Figure], dict[str, Figure]]:
-    """Return FEM's changes of the draws and of the corrected posterior, and its means and sds."""
+    """Return FEM's changes of the draws and of the corrected posterior, and its means and sds.
+
+    Changes are of logarithms where a parameter's scale is logarithmic: the sd of a parameter that
+    is known to a factor of ten is decided by a few draws.
+    """
     pool, names, p = tests.pool, posterior.model.names, len(posterior.model.names)
-    draws = np.stack(list(posterior.draws().values()), axis=1)
-    x, corrected = pool.predictive.columns(pool.z), pool.corrected
+    on_scales = pool.predictive.on_scales
+    values = pool.predictive.columns(pool.z)
+    draws = on_scales(np.stack(list(posterior.draws().values()), axis=1))
+    x, corrected = on_scales(values), pool.corrected
     by_fem, by_map = normalised(tests.log_fem), normalised(tests.log_corrected)
     # Masses are below quantiles of the draws, and of the corrected posterior.
     levels = list(LARGEST_MASS)
@@ -165,7 +171,8 @@ def figures_of(
 
     def figures(rows: np.ndarray, weights: np.ndarray) -> np.ndarray:
         share = weights / total if (total := weights.sum()) > 0.0 else weights * np.nan
-        return np.concatenate([moments(x[rows], weights), share @ x_below[rows]])
+        plain = moments(values[rows], weights)[: 2 * p]
+        return np.concatenate([moments(x[rows], weights), share @ x_below[rows], plain])
 
     def change(used: np.ndarray) -> np.ndarray:
         return figures(tests.rows, by_fem * used) - figures(tests.rows, by_map * used)
@@ -175,13 +182,13 @@ def figures_of(
     step, step_error = jackknife(change, len(tests.rows))
     fem, error = base + step, np.hypot(base_error, step_error)
     # The draws' own mass below their quantiles: a quantile may be a draw that comes often.
-    plain = np.concatenate([moments(draws, np.ones(len(draws))), below(draws).mean(axis=0)])
-    sd = np.exp(fem[p : 2 * p])
+    before = np.concatenate([moments(draws, np.ones(len(draws))), below(draws).mean(axis=0)])
+    count, sd = len(before), np.exp(fem[-p:])
     return (
-        _changes(names, fem - plain, error, plain, edges=0),
-        _changes(names, step, step_error, base, edges=1),
-        dict(zip(names, as_figures(fem, error), strict=False)),
-        dict(zip(names, as_figures(sd, sd * error[p : 2 * p]), strict=True)),
+        _changes(names, fem[:count] - before, error[:count], before, edges=0),
+        _changes(names, step[:count], step_error[:count], base[:count], edges=1),
+        dict(zip(names, as_figures(fem[count : count + p], error[count : count + p]), strict=True)),
+        dict(zip(names, as_figures(sd, sd * error[-p:]), strict=True)),
     )
 
 
@@ -302,7 +309,7 @@ def misfits(
     flat = jnp.asarray(predictive.corrected_means(z, correction))
 
     def discrepancies(flat: jax.Array, draw: dict[str, jax.Array], key: jax.Array) -> Any:
-        means = predictive.by_name(flat)
+        means = model.observe.unravel(flat)
         parts = model.distributions(draw, means)
         key, mesh_key = jax.random.split(key)
         errors = jax.tree.map(jnp.subtract, model.fem_means(mesh_key, draw, means), means)

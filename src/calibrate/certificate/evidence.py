@@ -74,7 +74,7 @@ def all_within(comparisons: list[Comparison]) -> bool | None:
 
 @dataclass(frozen=True)
 class Changes:
-    """The changes of a posterior by FEM.
+    """The changes of a posterior by FEM, of logarithms where a parameter's scale is logarithmic.
 
     shift : the change of each mean, in posterior sd, by parameter.
     log_sd : the change of the logarithm of each sd, by parameter.

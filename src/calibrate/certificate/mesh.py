@@ -31,12 +31,6 @@ from calibrate.certificate.evidence import (
     all_within,
 )
 from calibrate.certificate.runs import FEMRuns
-from calibrate.statistical_model.correction import (
-    Correction,
-    corrections,
-    fit_correction,
-    no_correction,
-)
 from calibrate.statistical_model.finer_fem import FinerFEM, MeshPair, finer_fem
 from calibrate.statistical_model.pool import Pool
 from calibrate.statistical_model.predictive import Predictive
@@ -48,6 +42,12 @@ from emulator.fem import Simulator
 from emulator.fem.campaign import in_order
 from emulator.fem.solution import EquilibriumSolver
 from emulator.scenes.scene import Scene
+from emulator.surrogates.correction import (
+    Correction,
+    corrections,
+    fit_correction,
+    no_correction,
+)
 
 MOST_RUNS = 30
 """Default of the largest number of solves on the finer mesh."""
@@ -132,10 +132,10 @@ def mesh_change(
 
 
 def _differences_of_fem(predictive: Predictive, finer: FinerFEM, bar: tqdm) -> Differences:
-    """Return FEM's differences; solves of the finer FEM run in parallel.
+    """Return FEM's differences; each point starts from the finer solutions of earlier ones.
 
-    Each starts from the finer solutions of its own point's earlier states, of the first point, and
-    of earlier calls: never from what another thread may have finished or not.
+    Where points are solved at once, of the first point, and of earlier calls: never from what
+    another thread may have finished or not.
     """
     known: list[MeshErrorEstimate] = []
 
@@ -150,7 +150,7 @@ def _differences_of_fem(predictive: Predictive, finer: FinerFEM, bar: tqdm) -> D
         points = ({name: values[k] for name, values in draws.items()} for k in range(len(z)))
         for number, pair in enumerate(in_order(difference, points, finer.workers)):
             if pair is not None:  # the first point is solved alone
-                (later if number else known).extend(pair.estimates)
+                (later if number and finer.workers > 1 else known).extend(pair.estimates)
             bar.update(len(predictive.model.states.states))
             yield None if pair is None else pair.fine - pair.coarse
         known.extend(later)
@@ -221,7 +221,7 @@ def _change(
     """
     # The corrected posterior on the mesh, over the same points.
     before = fine.corrected_by(correction_by(z[:0], D[:0])[0]).corrected
-    x = fine.predictive.columns(fine.z)
+    x = fine.predictive.on_scales(fine.predictive.columns(fine.z))
     p = x.shape[1]
 
     def change(after: np.ndarray, used: np.ndarray | float = 1.0) -> np.ndarray:

@@ -26,9 +26,9 @@ from scipy.linalg import eigh
 from scipy.special import chdtri
 from tqdm import tqdm
 
-from calibrate.statistical_model.correction import Correction, fit_correction, no_correction
 from calibrate.statistical_model.fem_likelihood import FEMLikelihood, Likelihoods
 from calibrate.statistical_model.predictive import Predictive, gauss_newton_step
+from emulator.surrogates.correction import Correction, fit_correction, no_correction
 
 ROUNDS = 4  # runs of a descent
 _LIKELY = 0.999  # mass of the Gaussian at the best run in which a point counts as likely

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from scipy.sparse import csr_array, eye_array, vstack
 
 from calibrate.measurements.observation import Observation, check_values
@@ -97,6 +98,10 @@ class Observations:
             name: self.entries[name].shape if name in self.entries else part.shape
             for name, part in self.parts.items()
         }
+
+    def unravel(self, flat: jax.Array) -> Data:
+        """Return flat data (m,), in the order of ``ravel_pytree``, by the parts' names."""
+        return ravel_pytree({n: jnp.zeros(shape) for n, shape in self.shapes.items()})[1](flat)
 
     def only(self, names: Iterable[str]) -> Observations | None:
         """Return the observations of these names; None where there is none."""

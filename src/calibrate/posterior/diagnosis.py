@@ -41,6 +41,9 @@ MAP_ERRORS, SCALED_NOISE = "map_errors", "scaled_noise"
 MAP_MOVES = "map_moves"  # a number: the largest move of a mean by FEM in the map's place, in sd
 
 TAUGHT_AT = "taught_at"  # draws by name, as JSON, at which FEM has taught the map
+ROUNDS_RECORD = "rounds"  # what each round of FEM runs said of the map before it taught it, as JSON
+FORESEEN = 0.1  # nats by which such a map may miss log likelihoods at draws, in root mean square
+FORESEEN_ANYWHERE = 1.0  # the same wherever the data are likely
 SMALLEST_P = 0.005
 OUTLYING = 4.0  # sds, beyond which 0.6 % of sets of 100 Gaussian data have a datum
 LARGEST_MAP_ERROR = 0.5  # noise sd by which the forward map may miss FEM's data
@@ -195,6 +198,7 @@ def diagnose(
     )
     if wrong_map is not None:
         yield ": ".join(wrong_map)
+    yield from _round_faults(json.loads(attributes.get(ROUNDS_RECORD, "[]")))
     if box:
         yield ": ".join(in_words(box))
     yield from _chain_faults(draws, statistics, summary, wrong_map is None, bool(box))
@@ -208,6 +212,18 @@ def diagnose(
             "all draws: use a sampler for several modes, such as smc, or a prior that leaves one "
             "of them out"
         )
+
+
+def _round_faults(rounds: Sequence[Mapping[str, float]]) -> Iterator[str]:
+    """Yield a sentence where the last round did not foresee FEM."""
+    for last in rounds[-1:]:
+        missed, worst = last["missed"], last["worst"]
+        if not (missed <= FORESEEN and worst <= FORESEEN_ANYWHERE):
+            yield (
+                f"FEM was not foreseen by the last round: log likelihoods were missed by "
+                f"{missed:.2g} nats at draws, by {worst:.2g} at worst; allow more runs, "
+                f"--most-runs {2 * int(last['runs'])}"
+            )
 
 
 def _chain_faults(

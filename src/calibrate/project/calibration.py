@@ -13,7 +13,7 @@ from calibrate.certificate import Certificate, examine
 from calibrate.certificate.reweighting import can_reweight, reweighted
 from calibrate.measurements import missing_values
 from calibrate.posterior import Posterior, sample
-from calibrate.posterior.diagnosis import MAP_ERRORS, MAP_MOVES, SCALED_NOISE
+from calibrate.posterior.diagnosis import MAP_ERRORS, MAP_MOVES, ROUNDS_RECORD, SCALED_NOISE
 from calibrate.project.problem import Problem, build_model, read_problem, simulator_of, with_data
 from calibrate.project.results import (
     CERTIFICATE,
@@ -24,7 +24,7 @@ from calibrate.project.results import (
     save_results,
     save_reweighted,
 )
-from calibrate.project.rounds import ROUNDS_RECORD, account_of, by_rounds, taught_map
+from calibrate.project.rounds import account_of, by_rounds, taught_map
 from calibrate.project.run import Run
 from calibrate.provenance import as_attributes
 from calibrate.state_names import split
@@ -90,8 +90,9 @@ def infer(
                 checkpoint=checkpoint,
             )
         errors = NOT_ASKED
-        # The states of a specimen, which has no mesh, are solved, not learned.
-        is_learned = isinstance(problem.scene, Scene) and not isinstance(model.full, FEMForward)
+        # The states of a specimen, which has no mesh, are solved; rounds have tested their map.
+        is_learned = isinstance(problem.scene, Scene) and forward is None
+        is_learned = is_learned and not isinstance(model.full, FEMForward)
         if check_map and is_learned:
             with stages("check of the map"):
                 simulator = cast(Simulator, problem.simulator)

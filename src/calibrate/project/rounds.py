@@ -5,18 +5,20 @@ each parameter, and FEM is asked where it says most:
 
 1. **Begin.** A few runs, with derivatives, are spread over the prior.
 2. **Repeat.** A Gaussian process of the data's means and their derivatives is fitted to all runs
-   (:mod:`calibrate.statistical_model.correction`), weighted points follow its posterior
+   (:mod:`emulator.surrogates.correction`), weighted points follow its posterior
    (:mod:`calibrate.statistical_model.pool`), and fresh runs are made at some of them: half are
    draws of that posterior, which test the process before they teach it, half are far from all runs,
    where it doubts.
-3. **End.** The rounds end when the process foresees FEM at the draws of a round: their log
-   likelihoods differ by less than 0.1 nats in root mean square, twice, or no more runs are
-   allowed. A posterior whose log density is wrong by the sd :math:`s` has means wrong by :math:`s`
-   sd at most, since :math:`|\mathrm{cov}(x, w)| \le \mathrm{sd}(x)\, \mathrm{sd}(w)`.
-4. **Teach.** The displacements of all runs, with their sensitivities, become an emulator of the
-   whole body (:mod:`emulator.surrogates.discrepancy`).
+3. **End.** The rounds end when the process foresees FEM: log likelihoods at the draws of a round
+   differ by less than 0.1 nats in root mean square, and by less than 1 nat wherever FEM or the
+   process finds the data likely, twice, or no more runs are allowed. A posterior whose log density
+   is wrong by the sd :math:`s` has means wrong by :math:`s` sd at most, since
+   :math:`|\mathrm{cov}(x, w)| \le \mathrm{sd}(x)\, \mathrm{sd}(w)`.
+4. **Teach.** The process of the last round gives the data of the posterior that is sampled. The
+   displacements of all runs, with their sensitivities, become an emulator of the whole body
+   (:mod:`emulator.surrogates.discrepancy`), for pictures and predictions of anything else.
 
-The certificate judges the emulator, by FEM runs of its own.
+The certificate judges the posterior, by FEM runs of its own.
 """
 
 from __future__ import annotations
@@ -29,11 +31,17 @@ from typing import Any, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from calibrate.certificate.runs import FEMRunner, FEMRuns, correction_from, least_likely
 from calibrate.importance.proposals import key_from
 from calibrate.importance.weights import normalised
-from calibrate.posterior.diagnosis import TAUGHT_AT
+from calibrate.posterior.diagnosis import (
+    FORESEEN,
+    FORESEEN_ANYWHERE,
+    ROUNDS_RECORD,
+    TAUGHT_AT,
+)
 from calibrate.project.problem import Problem, build_model, read_problem
 from calibrate.statistical_model import FEMLikelihood, Model
 from calibrate.statistical_model.density import density_of, in_blocks, prior_draws
@@ -50,16 +58,13 @@ from emulator.surrogates import registry, shipped
 from emulator.surrogates.discrepancy import maximin_subset
 from emulator.surrogates.emulator import EMULATOR, Emulator
 from emulator.surrogates.protocol import ForwardMap
-from emulator.surrogates.taught import ROUNDS, TaughtEmulator, taught
+from emulator.surrogates.taught import ROUNDS, DataProcess, TaughtEmulator, no_process, taught
 from emulator.training.mechanics import add_discrepancy
 
-ROUNDS_RECORD = "rounds"
-"""The entry of an emulator's record, and the attribute of a posterior, that lists the rounds."""
 _ARRAYS = ("theta", "displacement", "sensitivities")  # of a file of solutions
 _A_ROUND = 8  # runs of a round; half of them are draws
 _BEGIN = 10  # runs spread over the prior
 _CANDIDATES = 16  # points of which one is taken, where the farthest are
-_FORESEEN = 0.1  # nats by which a log likelihood may be missed
 _LIKELY = 0.99  # mass of the Gaussian at the best run in which draws count
 _NOISE_DRAWS = 256  # draws of the prior of a noise sd that is inferred
 
@@ -71,11 +76,13 @@ class Round:
     runs : the number of runs so far. failed : those at which FEM failed.
     missed : the root mean square by which log likelihoods at the round's draws were missed, nats;
         infinite where no draw was likely.
+    worst : the largest miss of a log likelihood at any of its likely points, nats.
     """
 
     runs: int
     failed: int
     missed: float
+    worst: float
 
 
 def teach(
@@ -104,7 +111,6 @@ def teach(
     """
     rng = np.random.default_rng([seed, 2])
     kept = {} if keep is None else _read(keep, simulator.scene.fingerprint)
-    likelihood = FEMLikelihood(model, simulator, kept=kept)
     rounds = list[Round]()
     with (
         one_blas_thread(),
@@ -112,8 +118,9 @@ def teach(
             total=most, desc="FEM where the posterior is", disable=not progress, unit="run"
         ) as bar,
     ):
+        model, blank = _before_runs(model, simulator.scene)
         predictive = Predictive(model, data, _noise_draws(model))
-        solver = FEMRunner(predictive, likelihood, bar)
+        solver = FEMRunner(predictive, FEMLikelihood(model, simulator, kept=kept), bar)
 
         def ask(z: np.ndarray) -> FEMRuns:
             answers = solver(z, slopes=True)
@@ -130,12 +137,23 @@ def teach(
             runs = FEMRuns.joined([runs, answers])
             bar.set_postfix_str(f"log likelihoods missed by {rounds[-1].missed:.2g}")
         bar.close()
+        learned = correction_from(runs, predictive, most).of_scaled(*predictive.scale_of_features)
     emulator, record = add_discrepancy(Emulator(simulator.scene), _runs_of(kept))
     at = predictive.constrain(runs.z[runs.converged])
     taught_at = {name: values.tolist() for name, values in at.items()}
     rounds_record = {ROUNDS_RECORD: [asdict(r) for r in rounds], TAUGHT_AT: taught_at}
     record = {"discrepancy": record, **rounds_record}
-    return taught(replace(emulator, record=record))
+    return taught(replace(emulator, record=record), replace(blank, correction=learned))
+
+
+def _before_runs(model: Model, scene: Scene) -> tuple[Model, DataProcess]:
+    """Return the model by a process that knows nothing, and the process: the body is at rest."""
+    draws = model.prior_draws(jax.random.key(0), 1)
+    means, _ = model.predict({name: values[0] for name, values in draws.items()})
+    constant = np.asarray(ravel_pytree(means)[0])
+    process = no_process(model.question, constant, len(model.states.unknowns))
+    full = taught(Emulator(scene), process)
+    return replace(model, full=full, forward=full.at(model.observe.nodes)), process
 
 
 def by_rounds(problem: Problem) -> Problem:
@@ -190,7 +208,8 @@ def _require_half(runs: FEMRuns) -> None:
 
 def _are_foreseen(rounds: list[Round]) -> bool:
     """Return whether FEM was foreseen in the last two rounds."""
-    return len(rounds) > 1 and all(r.missed <= _FORESEEN for r in rounds[-2:])
+    foreseen = [r.missed <= FORESEEN and r.worst <= FORESEEN_ANYWHERE for r in rounds[-2:]]
+    return len(foreseen) > 1 and all(foreseen)
 
 
 def _noise_draws(model: Model) -> dict[str, np.ndarray]:
@@ -231,14 +250,15 @@ def _fresh_points(
 
 def _judged(runs: FEMRuns, answers: FEMRuns, predicted: np.ndarray, drawn: int) -> Round:
     """Return what a round's answers at its first ``drawn`` points say of what was predicted."""
-    every = FEMRuns.joined([runs, answers])
+    every, predicted = FEMRuns.joined([runs, answers]), predicted[: len(answers.z)]
     least = least_likely(every.fem.max(), every.z.shape[1], _LIKELY)
+    likely = np.maximum(answers.fem, predicted) > least
     with np.errstate(invalid="ignore"):
-        missed = (answers.fem - predicted[: len(answers.fem)])[:drawn]
-    missed = missed[np.maximum(answers.fem, predicted[: len(answers.fem)])[:drawn] > least]
+        missed = np.abs(answers.fem - predicted)
+    at_draws = missed[:drawn][likely[:drawn]]
+    size = float(np.sqrt(np.mean(at_draws**2))) if at_draws.size else np.inf
     failed = int((~every.converged).sum())
-    size = float(np.sqrt(np.mean(missed**2))) if missed.size else np.inf
-    return Round(len(every.z), failed, size)
+    return Round(len(every.z), failed, size, float(missed[likely].max(initial=0.0)))
 
 
 def _runs_of(kept: Mapping[bytes, Field]) -> Runs:

@@ -311,9 +311,8 @@ def in_noise_sd(
     """
     if not len(errors) or model.error.is_learned:
         return {}
-    unravel = ravel_pytree({name: jnp.zeros(n) for name, n in model.observe.shapes.items()})[1]
     sizes, sds = {}, noise_sds(model, draws)
-    for name, values in jax.vmap(unravel)(jnp.asarray(errors)).items():
+    for name, values in jax.vmap(model.observe.unravel)(jnp.asarray(errors)).items():
         square = np.square(np.asarray(values).reshape(len(errors), -1))
         sizes[name] = float(np.median(np.sqrt(square.mean(axis=1))) / sds[name])
     return sizes

@@ -19,6 +19,7 @@ from emulator.accuracy.mesh_error import MeshError, MeshErrorEstimate, mesh_erro
 from emulator.core.rooms import offered
 from emulator.fem import Simulator
 from emulator.fem.campaign import at_once
+from emulator.fem.linear.suitesparse import LARGE
 from emulator.fem.solution import EquilibriumSolver
 from emulator.scenes.scene import Scene
 
@@ -99,7 +100,8 @@ class _OnFinerMesh:
 
     @property
     def workers(self) -> int:
-        return at_once(self.error.simulator, self.nodes)
+        # Large factorisations share the cores well, and each point is a good start of the next.
+        return 1 if 3 * self.nodes >= LARGE else at_once(self.error.simulator, self.nodes)
 
     def __call__(self, draw: Mapping[str, Any], known: Known = ()) -> MeshPair:
         """Return the data; solves start from ``known`` and from the draw's earlier states."""

@@ -59,6 +59,17 @@ class LoadStates:
         rows = [jnp.stack([entry(e) for e in row], axis=-1) for row in self.entries]
         return jnp.stack(rows, axis=-2)
 
+    def values(self, thetas: jax.Array) -> jax.Array:
+        """Return the value (q,) of every unknown from theta (S, p): the inverse of :meth:`thetas`.
+
+        Theta's known entries are not looked at.
+        """
+        places: dict[str | float, tuple[int, int]] = {}
+        for k, row in enumerate(self.entries):
+            for column, entry in enumerate(row):
+                places.setdefault(entry, (k, column))
+        return jnp.stack([thetas[places[name]] for name in self.unknowns])
+
 
 def load_states(
     scene: ForwardProblem,

@@ -12,6 +12,7 @@ emulator with a correction, a reduced model or FEM.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -39,7 +40,9 @@ from calibrate.statistical_model.prior_range import check_known, fit_to, standar
 from emulator.core.errors import InputError
 from emulator.core.kept import kept
 from emulator.scenes.parameter_space import Parameter
-from emulator.surrogates.protocol import ForwardMap, Prediction
+from emulator.surrogates.correction import correction_at
+from emulator.surrogates.protocol import ForwardMap, Prediction, fingerprint_of
+from emulator.surrogates.taught import DataProcess
 
 mend_numpyro()
 
@@ -213,7 +216,7 @@ class Model:
         thetas : theta in every load state, (S, p).
         prediction : the result of :meth:`evaluate` there, where it is known already.
         """
-        if prediction is None:
+        if prediction is None or self._process is not None:
             return self._through(thetas)
         displacement, valid = prediction
         return self.observe(jnp.where(valid, displacement, 0.0), thetas), valid
@@ -221,7 +224,30 @@ class Model:
     @cached_property
     def _through(self) -> Callable[[jax.Array], tuple[dict[str, jax.Array], jax.Array]]:
         """The data that the map predicts, as a function of theta in every load state."""
-        return self.observe.through(self.full)
+        if (process := self._process) is None:
+            return self.observe.through(self.full)
+        unravel = self.observe.unravel
+        space = self.forward.scene.space
+
+        def data(thetas: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
+            valid = jnp.all(space.contains(thetas))
+            x = self.on_scales(self.states.values(thetas))
+            flat = process.constant + correction_at(process.correction, x)
+            return unravel(jnp.where(valid, flat, 0.0)), valid
+
+        return data
+
+    @cached_property
+    def _process(self) -> DataProcess | None:
+        """The process of these data in place of the map's displacement, where the map has one."""
+        data_of = getattr(self.full, "data_of", None)
+        return None if data_of is None else data_of(self.question)
+
+    @cached_property
+    def question(self) -> str:
+        """Short hash of what is observed, and of the unknowns that it follows from."""
+        words = [self.observe.to_json(), self.states.to_json(), self.on_log_scale.tolist()]
+        return fingerprint_of(json.dumps(words))
 
     def evaluate(self, thetas: jax.Array) -> Prediction:
         """Return the displacement (S, k, 3) mm of the observed nodes at ``thetas`` (S, p)."""

@@ -21,10 +21,10 @@ import numpy as np
 
 from calibrate.importance.proposals import Kernels
 from calibrate.importance.weights import normalised
-from calibrate.statistical_model.correction import Correction, fit_correction
 from calibrate.statistical_model.density import finite_coordinates
 from calibrate.statistical_model.pool import Pool
 from calibrate.statistical_model.predictive import Predictive, gauss_newton_step
+from emulator.surrogates.correction import Correction, fit_correction
 
 _ROUNDS = 3  # of points that are no draws
 _SURPRISE = (

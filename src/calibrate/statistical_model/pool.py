@@ -24,8 +24,8 @@ from calibrate.importance.proposals import (
     resampled,
 )
 from calibrate.importance.weights import normalised
-from calibrate.statistical_model.correction import Correction
 from calibrate.statistical_model.predictive import Densities, Predictive
+from emulator.surrogates.correction import Correction
 
 _ENOUGH = 800.0  # effective points at which the pool is good
 _FOLLOWING = 2048  # points of the proposal that follows the draws

@@ -6,7 +6,7 @@ A certificate asks for the posterior where no draw is. In unconstrained coordina
 .. math:: \log p(z) + \log p(y \mid g(\theta(z)) + d(\theta(z)))
 
 with the prior and its Jacobian, the map's data without noise :math:`g`, and a correction :math:`d`
-(:mod:`calibrate.statistical_model.correction`), which is zero for the map alone.
+(:mod:`emulator.surrogates.correction`), which is zero for the map alone.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from scipy.linalg import eigh
 
-from calibrate.statistical_model.correction import Correction, correct, corrections
 from calibrate.statistical_model.density import (
     BATCH,
     Density,
@@ -33,6 +32,7 @@ from calibrate.statistical_model.density import (
     without_nan,
 )
 from calibrate.statistical_model.model import Data, Model
+from emulator.surrogates.correction import Correction, correct, corrections
 
 _WIDTH_DRAWS = 512  # draws of the prior, from which the scale of theta's features is taken
 
@@ -111,6 +111,12 @@ class Predictive:
         """Return draws (s, p) of the model's unknowns, in the order of their names."""
         draws = self.constrain(z)
         return np.stack([draws[name] for name in self.model.names], axis=1)
+
+    def on_scales(self, columns: np.ndarray) -> np.ndarray:
+        """Return :meth:`columns` (s, p), theta's unknowns on their parameters' scales."""
+        count = len(self.model.states.unknowns)
+        theta = np.asarray(self.model.on_scales(columns[:, :count]))
+        return np.concatenate([theta, columns[:, count:]], axis=1)
 
     def unconstrain(self, draws: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return z (s, p) of draws by name; a draw on a bound of its parameter is moved inside."""
@@ -191,7 +197,7 @@ class Predictive:
     @_compiled
     def _feature_slopes(self, z: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return the derivatives in the features: of the map's data (q, m), of theta (S, p, q)."""
-        centre, width = self._scale_of_features
+        centre, width = self.scale_of_features
 
         def thetas(x: jax.Array) -> jax.Array:
             values = self.model.from_scales(centre + width * x)
@@ -212,7 +218,7 @@ class Predictive:
     def _curvature(self, z: jax.Array, means: jax.Array, slopes: jax.Array) -> Any:
         def likelihood(z: jax.Array, flat: jax.Array) -> jax.Array:
             draws = self._constrain(z)
-            return self.model.fem_log_likelihood(draws, self.by_name(flat), self.data)
+            return self.model.fem_log_likelihood(draws, self.model.observe.unravel(flat), self.data)
 
         J = jax.jacfwd(lambda z: self.model.states.thetas(self._constrain(z)))(z)
         J = jnp.tensordot(slopes, J, axes=2)
@@ -233,7 +239,8 @@ class Predictive:
         return np.asarray(ravel_pytree(levels)[0])
 
     @cached_property
-    def _scale_of_features(self) -> tuple[np.ndarray, np.ndarray]:
+    def scale_of_features(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and sd (q,) over the prior of theta's unknowns on their parameters' scales."""
         with jax.ensure_compile_time_eval():
             draws = jax.jit(lambda key: self._on_scales(self.model.prior_draws(key, _WIDTH_DRAWS)))
             x = np.asarray(draws(jax.random.key(0)))
@@ -246,16 +253,11 @@ class Predictive:
 
     @_compiled
     def _features(self, draws: Mapping[str, jax.Array]) -> jax.Array:
-        centre, width = self._scale_of_features
+        centre, width = self.scale_of_features
         return (self._on_scales(draws) - centre) / width
 
     def _constrain(self, z: jax.Array) -> dict[str, jax.Array]:
         return jax.tree.map(lambda values: values[0], self._density.constrain(z[None]))
-
-    def by_name(self, flat: jax.Array) -> dict[str, jax.Array]:
-        """Return flat data (m,) by the observation's name."""
-        shapes = self.model.observe.shapes
-        return ravel_pytree({n: jnp.zeros(shape) for n, shape in shapes.items()})[1](flat)
 
     @_compiled
     def _map_block(self, z: jax.Array) -> Any:
@@ -274,7 +276,7 @@ class Predictive:
         def one(point: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
             draws = self._constrain(point[0])
             step, variance = correct(correction, self._features(draws))
-            means = self.by_name(point[1] + step)
+            means = self.model.observe.unravel(point[1] + step)
             return without_nan(self.model.fem_log_likelihood(draws, means, self.data)), variance
 
         return jax.lax.map(one, (z, means), batch_size=BATCH)

@@ -10,18 +10,20 @@ solutions, a half at :math:`k = 1`, as at the edge of a clamp; from linear to qu
 nearly all of it. So the difference has an effectivity of one half to one.
 
 No solve from rest is needed. The iteration on the finer mesh starts from the prolonged solution,
-plus a combination of the differences :math:`D_i` found at other :math:`\theta_i`, with the weights
+plus a combination of the differences :math:`D_i` found at other theta, with the weights
 
-.. math:: \min_w \; \Big|\sum_i w_i x_i - x\Big|^2 + 10^{-2}\, |w|^2, \qquad \sum_i w_i = 1
+.. math:: \min_w \; \Big|\sum_i w_i u_i - u\Big|^2 + 10^{-4}\, \overline{|u_i|^2}\, |w|^2
 
-of positions x in the unit box: linear interpolation where they surround theta. Without a known
-difference, the prolonged solution is far from balance: inside a coarse element only the mean strain
-is balanced, and strains vary about it. So two stress iterates
+with which the solutions on the mesh come closest to this one. What the finer mesh adds follows the
+deformation, whatever tissue and load it is of: for small displacements it is linear in it.
+Without a known difference, the prolonged solution is far from balance: inside a coarse element only
+the mean strain is balanced, and strains vary about it. So two stress iterates
 (:mod:`emulator.fem.stress_iterates`) begin with the mean strain measures of each coarse element.
 A Newton step is checked by a second back-substitution
 (:func:`emulator.accuracy.estimate.newton_distance`), and another step follows if what the second
-leaves is much. Where steps do not contract, as for locked elements far from any known theta, FEM
-solves on the finer mesh.
+leaves is much. Where steps do not contract, or what is known is further than 2 % from this
+deformation, the way to it from the nearest known theta is halved, and in the end FEM solves on the
+finer mesh.
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ from emulator.accuracy.estimate import Distance, newton_distance
 from emulator.core.errors import InputError
 from emulator.core.gaussian_process import Regression
 from emulator.fem.compiled import compiled
-from emulator.fem.linear.suitesparse import free_factors
+from emulator.fem.linear.suitesparse import free_factors, on_all_cores
 from emulator.fem.simulator import Simulator
 from emulator.fem.stress_iterates import StressIterates, applies
 from emulator.scenes.finer import Finer, finer
@@ -52,7 +54,10 @@ LARGEST = 60_000
 _TOLERANCE = 1e-7  # solves on the finer mesh: far below the meshes' difference
 _LEFT = 0.02  # largest share of the meshes' difference that the last step may leave
 _DIVERGENCE = 0.5  # contraction of a step above which FEM solves instead
-_RIDGE = 1e-2  # of the weights of known differences
+_RIDGE = 1e-4  # of the weights of known solutions, in their mean square
+_NEAR = 0.02  # of a displacement, up to which a combination of others is a start
+_HALVINGS = 3  # of the way from the nearest known theta
+_WHAT = "the error of the mesh"
 _STEPS = 3  # largest number of steps
 _STRESS_STEPS = 2  # stress iterates before them, without a known difference
 
@@ -122,30 +127,68 @@ class MeshError:
             No equilibrium was found on one of the meshes.
         """
         theta = jnp.asarray(theta, dtype=float)
-        what = "the error of the mesh"
-        coarse = self.simulator.solve(theta, start).require_converged(what).displacement
-        prolong = self.finer.refinement.carry
-        begin = prolonged = jnp.asarray(prolong(coarse))
-        if known:  # in NumPy: JAX would compile a program for each number of them
-            to_unit = self.simulator.scene.to_unit
-            positions = np.stack([to_unit(other.theta) for other in known])
-            weights = _weights(positions, np.asarray(to_unit(theta)))
-            on_finer = np.tensordot(weights, np.stack([other.fine for other in known]), 1)
-            on_mesh = np.tensordot(weights, np.stack([other.coarse for other in known]), 1)
-            begin = prolonged + (on_finer - prolong(on_mesh))
+        coarse = self.simulator.solve(theta, start).require_converged(_WHAT).displacement
         # A step solves one set of equations; a scene whose mesh is the loaded shape has two.
-        fine_by_steps = None
         if not self.fine.scene.loaded_by:
-            near = begin if known else self._nearer(theta, prolonged)
-            fine_by_steps = self._fine_by_steps(theta, near, prolonged)
-        if fine_by_steps is not None:
-            return MeshErrorEstimate(theta, coarse, fine_by_steps, solved=False)
+            with on_all_cores(3 * len(self.fine.scene.mesh.nodes)):
+                if (fine := self._by_steps(theta, coarse, known, _HALVINGS)) is not None:
+                    return MeshErrorEstimate(theta, coarse, fine, solved=False)
         with self._alone:
-            solution = self.fine.solve(theta, begin)
+            solution = self.fine.solve(theta, self._combined(coarse, known)[0])
             if not solution.converged:  # strains of locked elements may be too rough a start
                 solution = self.fine.solve(theta)
-        fine = solution.require_converged(f"{what}, on the finer one").displacement
+        fine = solution.require_converged(f"{_WHAT}, on the finer one").displacement
         return MeshErrorEstimate(theta, coarse, fine, solved=True)
+
+    def _by_steps(
+        self, theta: jax.Array, coarse: jax.Array, known: Sequence[MeshErrorEstimate], halvings: int
+    ) -> jax.Array | None:
+        """Return the displacement (f, 3) on the finer mesh by steps; None if they do not contract.
+
+        halvings : the number of times that the way from the nearest known theta may be halved.
+        """
+        begin, apart = self._combined(coarse, known)
+        prolonged = jnp.asarray(self.finer.refinement.carry(coarse))
+        if not known:
+            begin = self._nearer(theta, begin) if applies(self.fine.scene) else begin
+            return self._steps(theta, begin, prolonged)
+        if apart <= _NEAR:
+            fine = self._steps(theta, begin, prolonged)
+            if fine is not None:
+                return fine
+        if not halvings:
+            return None
+        to_unit, from_unit = self.simulator.scene.to_unit, self.simulator.scene.from_unit
+        x = to_unit(theta)
+        nearest = min(known, key=lambda o: float(jnp.sum((to_unit(o.theta) - x) ** 2)))
+        middle = from_unit(0.5 * (to_unit(nearest.theta) + x))
+        solution = self.simulator.solve(middle, coarse)
+        if not solution.converged:
+            return None
+        u = solution.displacement
+        fine = self._by_steps(middle, u, known, halvings - 1)
+        if fine is None:
+            return None
+        between = MeshErrorEstimate(middle, u, fine, solved=False)
+        return self._by_steps(theta, coarse, [*known, between], halvings - 1)
+
+    def _combined(
+        self, coarse: jax.Array, known: Sequence[MeshErrorEstimate]
+    ) -> tuple[jax.Array, float]:
+        """Return a start (f, 3) mm on the finer mesh, and how far what is known is from it.
+
+        That is the share of the displacement that no combination of known solutions has.
+        """
+        prolong = self.finer.refinement.carry
+        if not known:
+            return jnp.asarray(prolong(coarse)), 1.0
+        # In NumPy: JAX would compile a program for each number of them.
+        solutions, u = np.stack([np.asarray(o.coarse) for o in known]), np.asarray(coarse)
+        weights = _weights(solutions.reshape(len(known), -1), u.ravel())
+        on_finer = np.tensordot(weights, np.stack([other.fine for other in known]), 1)
+        rest = u - np.tensordot(weights, solutions, 1)
+        apart = np.linalg.norm(rest) / max(np.linalg.norm(u), np.finfo(float).tiny)
+        return jnp.asarray(on_finer + prolong(rest)), float(apart)
 
     def forget(self) -> None:
         """Free all factors that are kept: a large mesh's are gigabytes, and would stay."""
@@ -154,11 +197,9 @@ class MeshError:
     def _nearer(self, theta: jax.Array, prolonged: jax.Array) -> jax.Array:
         """Return the displacement (f, 3) mm after stress iterates from the ``prolonged`` one.
 
-        The prolonged one itself where the law has none, or a tangent is indefinite.
+        The prolonged one itself where a tangent is indefinite.
         """
         system = self.fine.system
-        if not applies(system.scene):
-            return prolonged
         iterates = StressIterates(system, self.fine.options.shrink, theta, jnp.ones(()))
         state = iterates.begin(prolonged)
         every = state.measures  # (m, q, k); the children of a coarse element follow each other
@@ -176,9 +217,7 @@ class MeshError:
     def _step(self) -> Callable[[jax.Array, jax.Array], Distance]:
         return compiled(partial(newton_distance, self.fine.system))
 
-    def _fine_by_steps(
-        self, theta: jax.Array, u: jax.Array, prolonged: jax.Array
-    ) -> jax.Array | None:
+    def _steps(self, theta: jax.Array, u: jax.Array, prolonged: jax.Array) -> jax.Array | None:
         """Take a few steps from ``u`` (f, 3) on the finer mesh; None if they do not contract.
 
         They end where what they leave, the contraction times the last step, is a small share of the
@@ -195,12 +234,15 @@ class MeshError:
         return None
 
 
-def _weights(known: np.ndarray, x: np.ndarray) -> np.ndarray:
-    r"""Return the weights (k,) with which known positions (k, p) come closest to ``x`` (p,).
+def _weights(known: np.ndarray, u: np.ndarray) -> np.ndarray:
+    r"""Return the weights (k,) with which known solutions (k, 3n) come closest to ``u`` (3n,).
 
-    At the minimum :math:`(X X^T + 10^{-2} I)\, w = X x + \mu 1`: regression with a linear kernel.
+    At the minimum :math:`(U U^T + 10^{-4}\, \overline{|u_i|^2} I)\, w = U u`: regression with a
+    linear kernel.
     """
-    return Regression.of(known @ known.T + _RIDGE * np.eye(len(known))).kriging_weights(known @ x)
+    K = known @ known.T
+    ridge = _RIDGE * max(float(np.diag(K).mean()), np.finfo(float).tiny)
+    return Regression.of(K + ridge * np.eye(len(known))).weights(known @ u)
 
 
 def mesh_error(simulator: Simulator | Scene, *, most: int = LARGEST) -> MeshError:

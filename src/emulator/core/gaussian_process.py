@@ -1,11 +1,7 @@
 r"""Gaussian processes: correlation functions, and regression on values and on derivatives.
 
 **Regression.** Observations y at inputs X, of covariance K with their noise, have the mean
-:math:`k(x, X)\, K^{-1} y` at another input x (Rasmussen and Williams 2006, Equation 2.25). If their
-constant mean is unknown, it is :math:`w^T y` with the weights of least variance among those of sum
-1 (ordinary kriging),
-
-.. math:: w = K^{-1} \left(k(X, x) + \mu 1\right), \qquad 1^T w = 1 .
+:math:`k(x, X)\, K^{-1} y` at another input x (Rasmussen and Williams 2006, Equation 2.25).
 
 **Correlations.** A correlation function gives the correlation of two points at the squared distance
 :math:`\rho`, in units of the length scales:
@@ -118,11 +114,6 @@ class Regression(NamedTuple):
     def inverse(self) -> Any:
         """Return K^-1, (n, n)."""
         return self.weights(_library(self.factor).eye(len(self.factor)))
-
-    def kriging_weights(self, covariances: Any) -> Any:
-        """Return w (n,), of sum 1, at an input x of ``covariances`` k(X, x), (n,)."""
-        at_x, of_ones = self.weights(covariances), self.inverse().sum(axis=1)
-        return at_x + of_ones * ((1.0 - at_x.sum()) / of_ones.sum())
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))

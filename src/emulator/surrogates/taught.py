@@ -1,18 +1,21 @@
-"""An emulator that rounds of FEM runs have taught where a posterior is.
+"""Maps that rounds of FEM runs have taught where one posterior is.
 
 The runs are chosen for one run's data, so the map is made and kept with that run
-(:mod:`calibrate.project.rounds`).
+(:mod:`calibrate.project.rounds`). It has two parts. The data of that run come from a Gaussian
+process of FEM's data, which FEM has tested where the posterior is; the displacement of the whole
+body, and every other quantity, from an emulator of the same runs.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.core.store import inside
 from emulator.scenes.scene import Scene, all_nodes
+from emulator.surrogates.correction import Correction, no_correction
 from emulator.surrogates.emulator import PARTS, CachedEmulator, Emulator
 from emulator.surrogates.part import arrays_of, together
 from emulator.surrogates.protocol import (
@@ -22,22 +25,76 @@ from emulator.surrogates.protocol import (
     Ingredients,
     Option,
     Options,
+    fingerprint_of,
 )
+
+_PROCESS = "data"  # prefix of the arrays of a process of data
+_SCALARS = ("length", "nugget", "scale", "local")
+
+
+@dataclass(frozen=True)
+class DataProcess:
+    """FEM's data, as a function of the unknowns on their scales, (q,).
+
+    question : the hash of what is observed, and of which unknowns it is a function.
+    constant : the data (m,) of the body at rest.
+    correction : what FEM adds to them.
+    """
+
+    question: str
+    constant: np.ndarray
+    correction: Correction
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return all that gives a value, by name; the variance's matrix is not kept."""
+        words = np.frombuffer(self.question.encode(), np.uint8)
+        process = self.correction._replace(inverse=np.zeros((0, 0)))._asdict()
+        return {"question": words, "constant": self.constant} | {
+            name: np.asarray(values, float if name in _SCALARS else None)
+            for name, values in process.items()
+        }
+
+    @classmethod
+    def restore(cls, arrays: Arrays) -> DataProcess:
+        """Return the process of :meth:`arrays`; ``KeyError`` where one is missing."""
+        process = {name: arrays[name] for name in Correction._fields}
+        process |= {name: float(arrays[name]) for name in _SCALARS}
+        process["local"] = bool(process["local"])
+        return cls(bytes(arrays["question"]).decode(), arrays["constant"], Correction(**process))
+
+
+def no_process(question: str, constant: np.ndarray, unknowns: int) -> DataProcess:
+    """Return the process before the first run: the body at rest, whatever the unknowns are."""
+    return DataProcess(question, constant, no_correction(1, unknowns, len(constant)))
 
 
 @dataclass(frozen=True, eq=False)
 class TaughtEmulator(CachedEmulator):
-    """An emulator over some nodes, of FEM runs that were made for one posterior."""
+    """An emulator over some nodes, of FEM runs that were made for one posterior.
+
+    data : the process of that posterior's data.
+    """
+
+    data: DataProcess = field(kw_only=True)
 
     kind = "rounds"
     label = "emulator by rounds of FEM"
 
+    @property
+    def fingerprint(self) -> str:
+        """Short hash of scene, emulator, nodes and process."""
+        return fingerprint_of(super().fingerprint, *self.data.arrays().values())
 
-def taught(emulator: Emulator) -> TaughtEmulator:
+    def data_of(self, question: str) -> DataProcess | None:
+        """Return the process of the data that ``question`` asks for; None where it is another."""
+        return self.data if self.data.question == question else None
+
+
+def taught(emulator: Emulator, data: DataProcess) -> TaughtEmulator:
     """Return the forward map of ``emulator`` over all nodes."""
     nodes = all_nodes(emulator.scene)
     cached = [part.cache(nodes) for part in emulator.parts.values()]
-    return TaughtEmulator(emulator, together(cached, len(nodes)), nodes)
+    return TaughtEmulator(emulator, together(cached, len(nodes)), nodes, data=data)
 
 
 def _refuse(_: Ingredients, __: Options) -> ForwardMap:
@@ -49,13 +106,15 @@ def _refuse(_: Ingredients, __: Options) -> ForwardMap:
 
 def _to_arrays(forward: ForwardMap) -> Arrays:
     assert isinstance(forward, TaughtEmulator)
-    return {name: np.asarray(array) for name, array in arrays_of(forward.emulator.parts).items()}
+    parts = {name: np.asarray(array) for name, array in arrays_of(forward.emulator.parts).items()}
+    return parts | {f"{_PROCESS}/{name}": a for name, a in forward.data.arrays().items()}
 
 
 def _from_arrays(scene: Scene, arrays: Arrays) -> TaughtEmulator:
     present = {name: inside(arrays, name) for name in PARTS}
     parts = {n: PARTS[n].restore(scene, {}, part) for n, part in present.items() if part}
-    return taught(Emulator(scene, **parts))  # type: ignore[arg-type]
+    process = DataProcess.restore(inside(arrays, _PROCESS))
+    return taught(Emulator(scene, **parts), process)  # type: ignore[arg-type]
 
 
 ROUNDS = ForwardKind(

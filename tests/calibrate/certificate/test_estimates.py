@@ -10,7 +10,6 @@ from calibrate.certificate import estimates
 from calibrate.certificate.estimates import jackknife, misfits, missed_by, moments
 from calibrate.certificate.runs import FEMRuns
 from calibrate.posterior.diagnosis import Misfit
-from calibrate.statistical_model.correction import no_correction
 from calibrate.statistical_model.pool import Pool
 from calibrate.statistical_model.predictive import Predictive
 from certificate_support import (
@@ -21,6 +20,7 @@ from certificate_support import (
     linear_model,
     quadrature,
 )
+from emulator.surrogates.correction import no_correction
 from linear_support import Step, linear_forward
 
 MANY = list(range(5, 45))

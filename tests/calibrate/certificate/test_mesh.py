@@ -13,8 +13,8 @@ from calibrate.certificate.evidence import Figure, MeshChange
 from calibrate.certificate.mesh import _at_draws, change_by, points_for
 from calibrate.certificate.verdict import judge
 from calibrate.statistical_model import with_error
-from calibrate.statistical_model.correction import fit_correction
 from certificate_support import exact_data, exact_posterior, grid_of, linear_model, quadrature
+from emulator.surrogates.correction import fit_correction
 from emulator.surrogates.taylor import expand
 from linear_support import LinearSimulator, linear_forward
 

@@ -8,10 +8,10 @@ from calibrate.importance import transport
 from calibrate.importance.proposals import Kernels, tempered
 from calibrate.importance.weights import effective, normalised
 from calibrate.samplers import density_of
-from calibrate.statistical_model.correction import no_correction
 from calibrate.statistical_model.pool import Pool
 from calibrate.statistical_model.predictive import Predictive
 from certificate_support import exact_data, exact_posterior, grid_of, linear_model, quadrature
+from emulator.surrogates.correction import no_correction
 
 
 @pytest.fixture(scope="module")

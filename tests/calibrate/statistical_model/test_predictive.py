@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calibrate.statistical_model.correction import correct, fit_correction, no_correction
 from calibrate.statistical_model.predictive import gauss_newton_step
+from emulator.surrogates.correction import correct, fit_correction, no_correction
 
 
 def points(count, seed=0):

@@ -35,6 +35,7 @@ import sparsax_cpp
 from threadpoolctl import ThreadpoolController
 
 from emulator.core.errors import InputError
+from emulator.core.machine import cores
 from emulator.fem.linear.pattern import Pattern
 
 _CHOLMOD, _UMFPACK = "calibrate_cholmod", "calibrate_umfpack"
@@ -51,6 +52,9 @@ class Outcome(IntEnum):
     INDEFINITE = 1  # not positive definite; a general factorisation may still solve
     SINGULAR = 2
 
+
+LARGE = 40_000
+"""Unknowns of a factorisation that gains by several threads."""
 
 Solved = tuple[jax.Array, jax.Array]
 """A solution x, (size,) or (size, k), and its :class:`Outcome`, int32 ()."""
@@ -80,9 +84,9 @@ def factor_and_solve(pattern: Pattern, values: jax.Array, rhs: jax.Array, kind: 
 def prepare() -> None:
     """Register both solvers, set the threads of their BLAS and the sizes of their caches, once.
 
-    The BLAS inside the sparse solver gets one thread: a second pool beside XLA's oversubscribes the
-    cores, and a factorisation of 2.5 ms then took up to 250 ms. Only the library bundled with
-    sparsax is changed, not NumPy's.
+    The BLAS inside the sparse solver gets one thread, but for :func:`on_all_cores`: a second pool
+    beside XLA's oversubscribes the cores, and a factorisation of 2.5 ms then took up to 250 ms.
+    Only the library bundled with sparsax is changed, not NumPy's.
 
     By default sparsax caches up to 32 UMFPACK and 8 CHOLMOD factors of each pattern, for matrices
     that recur. Ours recur only in consecutive solves, and a factor of a large mesh takes a
@@ -90,11 +94,21 @@ def prepare() -> None:
     """
     register(_CHOLMOD, sparsax_cpp.solve_f64_capsule(), _outcome)
     register(_UMFPACK, sparsax_cpp.umf_solve_f64_capsule(), _outcome)
-    for library in ThreadpoolController().lib_controllers:
-        if "sparsax" in library.filepath:
-            library.set_num_threads(1)
+    _set_threads(1)
     sparsax.set_umf_cache_size(_FACTORS)
     sparsax.set_num_cache_size(_FACTORS)
+
+
+@cache
+def _blas() -> list[Any]:
+    """Return the controllers of the BLAS inside the sparse solver."""
+    libraries = ThreadpoolController().lib_controllers
+    return [library for library in libraries if "sparsax" in library.filepath]
+
+
+def _set_threads(count: int) -> None:
+    for library in _blas():
+        library.set_num_threads(count)
 
 
 def _outcome(message: str) -> int | None:
@@ -123,6 +137,23 @@ def keeping_factors(count: int) -> Iterator[None]:
     finally:
         _kept.remove(count)
         sparsax.set_num_cache_size(_kept[-1])
+
+
+@contextmanager
+def on_all_cores(unknowns: int) -> Iterator[None]:
+    """Let factorisations inside the context use all cores, if they are large and alone.
+
+    They are alone where no threads keep factors (:func:`keeping_factors`). Two threads take 0.67 of
+    the time of one at 100 000 unknowns of quadratic elements, and gain nothing at 14 000.
+    """
+    alone = unknowns >= LARGE and len(_kept) == 1
+    if alone:
+        _set_threads(cores())
+    try:
+        yield
+    finally:
+        if alone:
+            _set_threads(1)
 
 
 def free_factors() -> None:

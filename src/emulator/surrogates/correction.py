@@ -1,7 +1,8 @@
 r"""The correction of a forward map that FEM runs teach: a Gaussian process of its errors.
 
-At some theta FEM was solved, and the map misses the data's means by :math:`D`. In places FEM's
-derivatives say how the miss changes, too, :math:`D' = \partial D / \partial x`. Between the runs
+At some theta FEM was solved, and the map misses the data's means by :math:`D`; a map that knows
+nothing misses all of them. In places FEM's derivatives say how the miss changes, too,
+:math:`D' = \partial D / \partial x`. Between the runs
 
 .. math:: d(x) = k(x, X)\, K^{-1} [D, D'], \quad
     k(x, x') = v (1 + x \cdot x') + e^{-\rho / 2}, \quad \rho = |x - x'|^2 / \ell^2
@@ -72,6 +73,10 @@ class Correction(NamedTuple):
     scale: float
     local: bool
 
+    def of_scaled(self, centre: np.ndarray, width: np.ndarray) -> Correction:
+        """Return the correction of features that are not yet standardised by ``centre, width``."""
+        return self._replace(centre=centre + width * self.centre, width=width * self.width)
+
 
 def no_correction(rows: int, features: int, data: int, observations: int = 0) -> Correction:
     """Return the correction that is zero, of the shape of one fitted to ``rows`` points.
@@ -103,15 +108,25 @@ def _covariance(x: np.ndarray, length: float) -> np.ndarray:
     return K
 
 
-def correct(correction: Correction, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the correction (m,) at features ``x`` (q,), and its variance in squared noise sd."""
-    c = correction
-    x = (x - c.centre) / c.width
+def _kernel(c: Correction, x: jax.Array) -> jax.Array:
+    """Return the covariances (N,) of the value at standardised features ``x`` (q,)."""
     gap = (x - c.at) / c.length
     bell = squared_exponential(jnp.sum(gap**2, axis=-1))
     value = _TREND * (1.0 + c.at @ x) + bell
     slopes = _TREND * x + gap * bell[:, None] / c.length
-    kernel = jnp.concatenate([value[:, None], slopes], axis=1).ravel()[c.observed]
+    return jnp.concatenate([value[:, None], slopes], axis=1).ravel()[c.observed]
+
+
+def correction_at(c: Correction, x: jax.Array) -> jax.Array:
+    """Return the correction (m,) at features ``x`` (q,)."""
+    return _kernel(c, (x - c.centre) / c.width) @ c.weights
+
+
+def correct(correction: Correction, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the correction (m,) at features ``x`` (q,), and its variance in squared noise sd."""
+    c = correction
+    x = (x - c.centre) / c.width
+    kernel = _kernel(c, x)
     prior_variance = _TREND * (1.0 + x @ x) + 1.0 + c.nugget
     variance = c.scale * jnp.maximum(prior_variance - kernel @ c.inverse @ kernel, c.nugget)
     return kernel @ c.weights, variance
@@ -120,7 +135,7 @@ def correct(correction: Correction, x: jax.Array) -> tuple[jax.Array, jax.Array]
 @jax.jit
 def corrections(correction: Correction, x: jax.Array) -> jax.Array:
     """Return the correction (s, m) at features ``x`` (s, q)."""
-    return jax.vmap(lambda row: correct(correction, row)[0])(x)
+    return jax.vmap(lambda row: correction_at(correction, row))(x)
 
 
 def fit_correction(
