@@ -9,6 +9,7 @@ body, and every other quantity, from an emulator of the same runs.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -57,10 +58,10 @@ class DataProcess:
     @classmethod
     def restore(cls, arrays: Arrays) -> DataProcess:
         """Return the process of :meth:`arrays`; ``KeyError`` where one is missing."""
-        process = {name: arrays[name] for name in Correction._fields}
+        process: dict[str, Any] = {name: arrays[name] for name in Correction._fields}
         process |= {name: float(arrays[name]) for name in _SCALARS}
-        process["local"] = bool(process["local"])
-        return cls(bytes(arrays["question"]).decode(), arrays["constant"], Correction(**process))
+        correction = Correction(**process)._replace(local=bool(process["local"]))
+        return cls(bytes(arrays["question"]).decode(), arrays["constant"], correction)
 
 
 def no_process(question: str, constant: np.ndarray, unknowns: int) -> DataProcess:
