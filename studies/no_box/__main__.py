@@ -11,6 +11,7 @@ truths inside 90 % intervals, and how far FEM would move a mean.
 import json
 import tempfile
 import time
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +24,48 @@ import emulator as em
 
 HERE = Path(__file__).parent
 SEED = 83
-# Observations, noise, and number of data sets of each body.
-BODIES: dict[str, tuple[str, dict[str, float], int]] = {
-    "once_clamped_beam": ("nodes:20", {"displacement": 0.2}, 6),
-    "twisting_cube": ("nodes:20", {"displacement": 0.05}, 4),
+VENTRICLE = """
+mesh = "ventricle.vtu"
+law = "holzapfel_ogden"
+order = 2
+loads = [{kind = "cavity_pressure", facet_set = "endocardium"}]
+supports = [{node_set = "base"}]
+fibres = {rule = "helix", endocardium = "endocardium", epicardium = "epicardium"}
+constants = {kappa = 25.0}
+[parameters]
+a = {unit = "kPa", range = [0.2, 0.52], scale = "log"}
+b = {unit = "", range = [1.0, 4.2], scale = "log"}
+a_f = {unit = "kPa", range = [3.0, 10.36], scale = "log"}
+b_f = {unit = "", range = [1.0, 4.46], scale = "log"}
+pressure = {unit = "kPa", range = [0.53, 1.33]}
+"""
+
+
+@dataclass(frozen=True)
+class Body:
+    """What is measured of one body.
+
+    scene : a built-in scene; None for the coarse ventricle of 583 nodes.
+    observe, noise, known : as in an experiment file. sets : the number of data sets.
+    """
+
+    scene: str | None
+    observe: str
+    noise: dict[str, float]
+    sets: int = 10
+    known: dict[str, float] = field(default_factory=dict)
+
+
+BODIES = {
+    "beam": Body("once_clamped_beam", "nodes:20", {"displacement": 0.2}),
+    "twisting cube": Body("twisting_cube", "nodes:20", {"displacement": 0.05}),
+    "liver": Body("liver", "nodes:20", {"displacement": 0.5}),
+    "ventricle": Body(
+        None, "volume", {"volume": 1.0}, known={f"pressure@p{k}": 0.4 * k for k in (1, 2, 3)}
+    ),
+    "ventricle, pressure unknown": Body(
+        None, "landmarks:24+volume", {"volume": 1.0, "displacement": 0.2}
+    ),
 }
 
 
@@ -43,20 +82,26 @@ def truth_of(scene: em.Scene, number: int) -> dict[str, float]:
     return drawn
 
 
-def one(body: str, number: int) -> dict[str, Any]:
-    """One data set of ``body``, to its verdict."""
-    observe, noise, _ = BODIES[body]
-    scene = em.find_scene(body)
-    truth = truth_of(scene, number)
-    ranges = {p.name: (p.low, p.high) for p in scene.parameters}
-    outside = sorted(n for n, v in truth.items() if not ranges[n][0] <= v <= ranges[n][1])
-    begin = time.perf_counter()
-    words = {"truth": truth, "noise": noise}
-    lines = [f'scene = "{body}"', f'observe = "{observe}"', 'forward = "rounds"']
-    lines += [f"seed = {SEED + number}"]
-    for entry, values in words.items():
-        lines += [f"[{entry}]", *(f'"{name}" = {value!r}' for name, value in values.items())]
+def one(name: str, number: int) -> dict[str, Any]:
+    """One data set of the body called ``name``, to its verdict."""
+    body, begin = BODIES[name], time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "ventricle.toml"
+        if body.scene is None:
+            file.write_text(VENTRICLE)
+            mesh = em.generators.human_ventricle(rings=5, around=12, layers=1, order=2)
+            em.write_mesh(file.with_suffix(".vtu"), mesh)
+        scene = em.find_scene(body.scene or str(file))
+        known = {parameter.split("@")[0] for parameter in body.known}
+        drawn = truth_of(scene, number)
+        truth = {n: value for n, value in drawn.items() if n not in known}
+        ranges = {p.name: (p.low, p.high) for p in scene.parameters}
+        outside = sorted(n for n, v in truth.items() if not ranges[n][0] <= v <= ranges[n][1])
+        words = {"truth": truth, "noise": body.noise, "known": body.known}
+        lines = [f"scene = '{body.scene or file}'", f'observe = "{body.observe}"']
+        lines += ['forward = "rounds"', f"seed = {SEED + number}"]
+        for entry, values in words.items():
+            lines += [f"[{entry}]", *(f'"{n}" = {value!r}' for n, value in values.items())]
         experiment = Path(folder) / "experiment.toml"
         experiment.write_text("\n".join(lines))
         posterior = cal.infer(cal.read_experiment(experiment), check_map=False)
@@ -97,7 +142,7 @@ def draw(cases: list[Case], path: Path) -> None:
     plt = pyplot()
     figure, axes = plt.subplots(figsize=(7, 3.2), layout="constrained")
     for row, body in enumerate(BODIES):
-        mine = [case for case in cases if case["name"].startswith(body)]
+        mine = [case for case in cases if case["name"].rsplit(" ", 1)[0] == body]
         for k, case in enumerate(mine):
             accepted = case["status"] == "accepted"
             axes.plot(
@@ -116,16 +161,16 @@ def draw(cases: list[Case], path: Path) -> None:
 def main() -> None:
     arguments = parser(__doc__, HERE).parse_args()
     results = Results(arguments.out, SEED, again=arguments.again)
-    for body, (*_, count) in BODIES.items():
-        for number in range(1 if arguments.quick else count):
-            results.case(f"{body} {number}", lambda b=body, n=number: one(b, n))
+    for name, body in BODIES.items():
+        for number in range(1 if arguments.quick else body.sets):
+            results.case(f"{name} {number}", lambda b=name, n=number: one(b, n))
     cases = results.cases
     summary = conclude(cases)
     results.write(summary=summary)
     draw(cases, arguments.out / "runs.png")
     print(summary)
     inside, of = summary["inside_90"]
-    assert arguments.quick or 0.8 * of <= inside
+    assert arguments.quick or 0.8 * of <= inside <= 0.97 * of
     assert all(case["status"] != "accepted" or case["largest_shift"] < 0.25 for case in cases)
 
 

@@ -18,14 +18,16 @@ r"""A check of a posterior against FEM, with as many solves as decide.
 Given the training runs, the tests are independent draws from a known density: the errors are honest
 however good or bad the correction is, and small where it is good.
 
-3. **Decide.** The check begins with 70 runs. While they leave the verdict undecided there are twice
-   as many, up to 200: the earlier ones train, and fresh points test. A figure is compared with its
-   limit at each look, with an error wide enough for these three
+3. **Decide.** The check begins with 70 runs, with 40 where runs before it have taught the map
+   (:mod:`calibrate.project.rounds`): these train the correction, too. While they leave the verdict
+   undecided there are twice as many, up to 200: the earlier ones train, and fresh points test. A
+   figure is compared with its limit at each look, with an error wide enough for these three
    (:mod:`calibrate.certificate.verdict`).
 """
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -48,6 +50,7 @@ from emulator.fem.solution import EquilibriumSolver
 from emulator.surrogates.correction import Correction
 
 _BEGIN, _AT_MOST = 70, 200  # FEM runs by default
+_BEGIN_TAUGHT = 40  # of a map that FEM runs have taught where the posterior is
 _FEWEST = 25
 # Shares of the runs that train the correction; the others test it.
 _AT_DRAWS, _AROUND, _AT_PRIOR, _DESCENTS, _ADAPTIVE = 0.15, 0.1, 0.1, 0.08, 0.12
@@ -82,10 +85,11 @@ def examine(
     at_most: int | None = None,
     mesh: int | None = None,
     seed: int = 0,
+    deadline: float = np.inf,
     progress: bool = False,
     stages: Stages | None = None,
 ) -> Check:
-    """Check ``posterior`` with FEM runs: 70, doubled up to 200 while the verdict is undecided.
+    """Check ``posterior`` with FEM runs: 70 or 40, doubled up to 200 while it is undecided.
 
     Parameters
     ----------
@@ -93,6 +97,8 @@ def examine(
     at_most : the number of runs up to which they are doubled while the verdict is undecided.
     mesh : the largest number of solves on the next finer mesh (:mod:`calibrate.certificate.mesh`),
         by default 30; 0 for none.
+    deadline : the value of ``time.perf_counter`` after which runs are not doubled, and no more
+        solves on the finer mesh begin.
     stages : the record of the seconds of each stage.
 
     Raises
@@ -101,7 +107,9 @@ def examine(
         The simulator is for another scene, the number of runs is too small, or ``at_most`` is below
         it.
     """
-    count, most = _checked_counts(draws, at_most, mesh)
+    taught_at = posterior.taught_at()
+    begin = _BEGIN_TAUGHT if taught_at else _BEGIN
+    count, most = _checked_counts(draws, at_most, mesh, begin)
     stages = Stages(show=False) if stages is None else stages
     predictive = Predictive(posterior.model, posterior.data, posterior.draws())
     rng = np.random.default_rng(seed)
@@ -124,7 +132,6 @@ def examine(
             descending = max(round(_DESCENTS * count), min(_FEWEST_DESCENTS, count // 6))
             descents, modes = descend(solver, at_prior, at_draws, z, descending, rng)
         training, total = FEMRuns.joined([at_draws, around, at_prior, descents]), count
-        taught_at = posterior.taught_at()
         known = [FEMRuns.of_map(predictive, predictive.unconstrain(taught_at))] if taught_at else []
         with stages("correction, and FEM that tests it"):
             while True:
@@ -133,7 +140,7 @@ def examine(
                 tests = Tests(pool, solver(pool.z[rows], slopes=True), rows, log_drawn)
                 runs = FEMRuns.joined([training, tests.runs])
                 evidence = evidence_of(posterior, at_draws, training, tests, len(modes), rng)
-                count = _further_runs(total, most)
+                count = _further_runs(total, most) if time.perf_counter() < deadline else 0
                 if judge(evidence).verdict != "undecided" or not count:
                     break
                 # The earlier tests train the next correction, and fresh points test it.
@@ -142,7 +149,9 @@ def examine(
         bar.close()
         with stages("finer mesh"):
             every = FEMRuns.joined([runs, *known])
-            change = mesh_change(pool, simulator, every, mesh, rng, progress=progress)
+            change = mesh_change(
+                pool, simulator, every, mesh, rng, deadline=deadline, progress=progress
+            )
     return Check(judge(replace(evidence, mesh=change)), posterior, tests)
 
 
@@ -155,10 +164,12 @@ def certify(posterior: Posterior, simulator: EquilibriumSolver, **options: Any) 
     return examine(posterior, simulator, **options).certificate
 
 
-def _checked_counts(draws: int | None, at_most: int | None, mesh: int | None) -> tuple[int, int]:
+def _checked_counts(
+    draws: int | None, at_most: int | None, mesh: int | None, begin: int
+) -> tuple[int, int]:
     """Return the numbers of FEM runs, to begin with and at most."""
     most = (_AT_MOST if draws is None else draws) if at_most is None else at_most
-    count = min(_BEGIN, most) if draws is None else draws
+    count = min(begin, most) if draws is None else draws
     if count < _FEWEST:
         raise InputError(f"certify: {count} FEM runs asked for; give {_FEWEST} or more")
     if mesh is not None and mesh < 0:

@@ -16,6 +16,7 @@ the posterior under the finer mesh's FEM as it is known by then, until every fig
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
@@ -84,6 +85,7 @@ def mesh_change(
     count: int | None,
     rng: np.random.Generator,
     *,
+    deadline: float = np.inf,
     progress: bool = False,
 ) -> MeshChange:
     """Return the changes of the corrected posterior by the next finer mesh.
@@ -93,10 +95,13 @@ def mesh_change(
     pool : the pool under the correction fitted to ``runs``.
     runs : all FEM runs of the check, on the mesh.
     count : the largest number of solves on the finer mesh, see :func:`points_for`; 0 for none.
+    deadline : the value of ``time.perf_counter`` after which no points are added.
     """
     predictive = pool.predictive
     if count == 0:
         return MeshChange(why="not asked")
+    if time.perf_counter() >= deadline:
+        return MeshChange(why="no time was left (--budget)")
     scene = simulator.scene
     if not isinstance(scene, Scene):
         (is_said_even,) = offered("calibrate.statistical_model.gripped_fem", "is_said_even")
@@ -119,7 +124,7 @@ def mesh_change(
     ) as bar:
         differences = _differences_of_fem(predictive, finer, bar)
         widened = predictive.model.error.of_mesh
-        change = change_by(differences, pool, runs, points, rng, widened=widened)
+        change = change_by(differences, pool, runs, points, rng, deadline=deadline, widened=widened)
     finer.forget()
     return replace(
         change,
@@ -165,6 +170,7 @@ def change_by(
     points: tuple[int, int],
     rng: np.random.Generator,
     *,
+    deadline: float = np.inf,
     widened: bool = False,
 ) -> MeshChange:
     """Return the changes of the corrected posterior by ``differences`` at a few points.
@@ -191,7 +197,8 @@ def change_by(
             )
         comparisons = change.comparisons()
         decided = not comparisons or all_within(comparisons) is not None
-        if asked >= most or (decided and asked >= enough) or _leaves_no_doubt(change):
+        ended = asked >= most or time.perf_counter() >= deadline
+        if ended or (decided and asked >= enough) or _leaves_no_doubt(change):
             return change
         more = min(max(asked // 2, 1), most - asked)
         more_z, more_D = _at_draws(differences, fine, more, rng, z)

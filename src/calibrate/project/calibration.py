@@ -46,6 +46,7 @@ def infer(
     *,
     force: bool = False,
     check_map: bool = True,
+    deadline: float = np.inf,
     progress: bool = False,
 ) -> Posterior:
     """Sample the posterior of a run.
@@ -58,6 +59,8 @@ def infer(
     force : replace the results of an earlier run in ``folder``.
     check_map : whether a few Newton steps tell how far the forward map is from what is observed;
         a certificate says so, too, and better.
+    deadline : the value of ``time.perf_counter`` by which rounds of FEM runs that teach a map end,
+        whether or not they foresee FEM.
 
     Raises
     ------
@@ -76,7 +79,7 @@ def infer(
         with stages("scene and data"):
             problem = with_data(by_rounds(read_problem(run)))
         with stages("forward map and model"):
-            forward = taught_map(problem, solutions, progress=progress)
+            forward = taught_map(problem, keep=solutions, deadline=deadline, progress=progress)
             model, data = build_model(problem, forward, progress=progress)
         sampler, options = problem.run.sampling()
         with stages("sampling"):

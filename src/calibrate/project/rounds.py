@@ -23,6 +23,7 @@ The certificate judges the posterior, by FEM runs of its own.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -32,6 +33,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from scipy.special import chdtri
 
 from calibrate.certificate.runs import FEMRunner, FEMRuns, correction_from, least_likely
 from calibrate.importance.proposals import key_from
@@ -65,6 +67,7 @@ _ARRAYS = ("theta", "displacement", "sensitivities")  # of a file of solutions
 _A_ROUND = 8  # runs of a round; half of them are draws
 _BEGIN = 10  # runs spread over the prior
 _CANDIDATES = 16  # points of which one is taken, where the farthest are
+_BULK = 0.95  # mass of the prior inside which FEM is asked where it may find the data likely
 _LIKELY = 0.99  # mass of the Gaussian at the best run in which draws count
 _NOISE_DRAWS = 256  # draws of the prior of a noise sd that is inferred
 
@@ -93,6 +96,7 @@ def teach(
     most: int,
     seed: int = 0,
     keep: Path | None = None,
+    deadline: float = np.inf,
     progress: bool = False,
 ) -> TaughtEmulator:
     """Return an emulator of FEM runs where the posterior is; its record lists the rounds.
@@ -103,6 +107,7 @@ def teach(
     most : the largest number of runs, each in every load state.
     keep : the file of FEM's solutions, from which a killed search goes on: the same points are
         asked, and those it holds are not solved again. None for none.
+    deadline : the value of ``time.perf_counter`` by which the last round is to end.
 
     Raises
     ------
@@ -128,9 +133,16 @@ def teach(
                 _write(keep, kept, simulator.scene.fingerprint)
             return answers
 
+        began = time.perf_counter()
         runs = ask(_spread_over_prior(predictive, min(_BEGIN, most), rng))
         _require_half(runs)
-        while len(runs.z) < most and not _are_foreseen(rounds):
+
+        def is_late() -> bool:
+            """Return whether a round as slow as those before would end too late."""
+            now = time.perf_counter()
+            return now + (now - began) * _A_ROUND / len(runs.z) > deadline
+
+        while len(runs.z) < most and not _are_foreseen(rounds) and not is_late():
             fresh, predicted, drawn = _fresh_points(predictive, runs, most, rng)
             answers = ask(fresh[: most - len(runs.z)])
             rounds.append(_judged(runs, answers, predicted, drawn))
@@ -170,12 +182,10 @@ def by_rounds(problem: Problem) -> Problem:
     return read_problem(replace(run, forward=ROUNDS.name), scene=scene)
 
 
-def taught_map(
-    problem: Problem, keep: Path | None = None, *, progress: bool = False
-) -> TaughtEmulator | None:
+def taught_map(problem: Problem, **options: Any) -> TaughtEmulator | None:
     """Return the map that rounds of FEM runs teach; None where the run names another one.
 
-    keep : the file of FEM's solutions, as of :func:`teach`.
+    options : ``keep``, ``deadline`` and ``progress`` of :func:`teach`.
     """
     run = problem.run
     if run.forward != ROUNDS.name:
@@ -186,7 +196,7 @@ def taught_map(
     model, data = replace(model, check_scale=False).given(data)
     most = registry.full_options(ROUNDS.name, run.forward_options)["most_runs"]
     simulator = cast(Simulator, problem.simulator)
-    return teach(model, data, simulator, most=most, seed=run.seed, keep=keep, progress=progress)
+    return teach(model, data, simulator, most=most, seed=run.seed, **options)
 
 
 def account_of(forward: ForwardMap) -> dict[str, Any]:
@@ -232,14 +242,19 @@ def _fresh_points(
     """Return points z (k, p) to ask FEM at, their predicted log likelihoods, and the draws' number.
 
     The first points are draws of the posterior as the runs so far have it. The others are those of
-    many, where FEM may find the data likely, that are farthest from all runs.
+    many, where FEM may find the data likely, that are farthest from all runs. Far out in the prior
+    a process may find anything likely, and FEM takes minutes: there, it is asked at draws only.
     """
     correction = correction_from(runs, predictive, most)
     pool = Pool.search(predictive, correction, None, (), rng)
     drawn = _A_ROUND // 2
     rows = pool.resampled(drawn, rng)
-    chances = 0.5 * (normalised(pool.log_explored) + pool.corrected)
-    others = rng.choice(len(pool.z), size=_CANDIDATES * (_A_ROUND - drawn), p=chances)
+    x = predictive.features(pool.z)
+    rare = (x**2).sum(axis=1) > chdtri(x.shape[1], 1.0 - _BULK)
+    explored = normalised(np.where(rare, -np.inf, pool.log_explored))
+    chances = explored + pool.corrected
+    size = _CANDIDATES * (_A_ROUND - drawn)
+    others = rng.choice(len(pool.z), size=size, p=chances / chances.sum())
     scale = np.sqrt(np.cov(pool.z[others], rowvar=False).reshape(len(pool.z[0]), -1).diagonal())
     known = np.concatenate([runs.z, pool.z[rows]])
     scale = np.maximum(scale, 1e-12)

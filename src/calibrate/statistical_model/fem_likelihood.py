@@ -139,8 +139,9 @@ class FEMLikelihood:
             for k in range(len(thetas))
             if k // states in solutions and k % states not in solutions[k // states]
         )
-        solver = Solver(self.simulator, sensitivities=slopes, from_rest_again=bool(kept))
-        nearest = self._kept_beside(thetas)
+        again = self.kept is not None
+        solver = Solver(self.simulator, sensitivities=slopes, from_rest_again=again)
+        nearest, near = self._kept_beside(thetas)
         # Not under jit: there the solver cannot use CHOLMOD, which is faster.
         for row in solve_rows(
             solver,
@@ -151,7 +152,7 @@ class FEMLikelihood:
             number, state = divmod(row.number, states)
             field = Field(row.solution.displacement, row.sensitivities)
             if self.kept is not None and row.converged:
-                self.kept[keys[row.number]] = field
+                self.kept[keys[row.number]] = near[row.number] = field
             if number not in solutions:
                 continue
             if not row.converged:
@@ -163,15 +164,20 @@ class FEMLikelihood:
                 fields = solutions.pop(number)
                 yield number, [fields[k] for k in range(states)]
 
-    def _kept_beside(self, thetas: jax.Array) -> Callable[[int], list[jax.Array]]:
-        """Return the starts from kept solutions of each of ``thetas`` (c, p), by its number."""
-        if not self.kept:
-            return lambda _: []
-        count = len(thetas)
-        known = np.array([np.frombuffer(key) for key in self.kept])
+    def _kept_beside(
+        self, thetas: jax.Array
+    ) -> tuple[Callable[[int], list[jax.Array]], dict[int, Field]]:
+        """Return the starts of each of ``thetas`` (c, p) by its number, and what they come from.
+
+        They come from kept solutions, and from those that are added by the numbers of ``thetas``.
+        """
+        if self.kept is None:
+            return lambda _: [], {}
+        count, width = thetas.shape
+        known = np.array([np.frombuffer(key) for key in self.kept]).reshape(-1, width)
         fields = {count + k: field for k, field in enumerate(self.kept.values())}
         every = jnp.concatenate([thetas, known])
-        return Neighbours(cast(Scene, self.simulator.scene), every, fields)
+        return Neighbours(cast(Scene, self.simulator.scene), every, fields), fields
 
     def _stable(self, fields: list[jax.Array], thetas: jax.Array) -> bool | None:
         """Return whether every state's equilibrium is a minimum of the energy, if there is one."""

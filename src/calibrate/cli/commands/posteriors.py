@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from argparse import ArgumentParser, Namespace
 from dataclasses import asdict
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING
 from calibrate.cli import words
 from calibrate.cli.output import check_plotly, members_summary, posterior_summary, table
 from calibrate.cli.run_words import run_options
-from calibrate.cli.words import Answer, command, flag, option
+from calibrate.cli.words import Answer, command, flag, option, seconds
 from emulator.core.errors import InputError
 from emulator.core.store import check_folder
 
@@ -22,6 +23,12 @@ if TYPE_CHECKING:
 @command(
     run_options("sampler", "sampler_options", "warmup", "draws", "chains", "seed"),
     flag("--no-certify", "leave the check against FEM for later"),
+    option(
+        "--budget",
+        "TIME",
+        "time for everything, e.g. 5m: the best posterior by then, and what "
+        "FEM says of it; where a scene has no emulator, half of it for rounds of FEM runs",
+    ),
     option("--out", "DIR", required=True),
     flag("--force", "replace the results of an earlier run in DIR"),
     help="sample a posterior",
@@ -43,9 +50,15 @@ def infer(arguments: Namespace) -> Answer:
 
     folder, progress = check_folder(arguments.out), not arguments.json
     plan, force, certify = plan_of(arguments), arguments.force, not arguments.no_certify
+    begin, budget = time.perf_counter(), math.inf
+    if arguments.budget is not None:
+        budget = seconds(arguments.budget)
     written = f"written to {arguments.out}; its page: calibrate report {arguments.out}"
     if not isinstance(plan, Run | Problem):
         from calibrate.project.members import infer_members, members_report  # a room
+
+        if arguments.budget is not None:
+            raise InputError("--budget is of one run; members of a population take their time")
 
         hierarchy, verdicts = infer_members(
             plan, folder, certify=certify, force=force, progress=progress
@@ -59,11 +72,22 @@ def infer(arguments: Namespace) -> Answer:
         raise InputError(
             f"--warmup has no effect with sampler '{sampler.name}', which does not adapt"
         )
-    posterior = infer(problem, folder, force=force, check_map=not certify, progress=progress)
+    posterior = infer(
+        problem,
+        folder,
+        force=force,
+        check_map=not certify,
+        deadline=begin + 0.5 * budget,
+        progress=progress,
+    )
     certificate = None
     if certify:
         certificate = certify_and_keep(
-            posterior, folder, load_steps=run.load_steps, progress=progress
+            posterior,
+            folder,
+            load_steps=run.load_steps,
+            deadline=begin + budget,
+            progress=progress,
         )
     result = report(run, posterior, certificate)
     usable = certificate is None or certificate.verdict == "accepted"
@@ -74,7 +98,8 @@ def _add_solves(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--draws",
         type=int,
-        help="FEM runs (default: 70, doubled up to 200 while the verdict is undecided)",
+        help="FEM runs (default: 70, or 40 after rounds of FEM runs, doubled up to 200 while the "
+        "verdict is undecided)",
     )
     parser.add_argument(
         "--until",
