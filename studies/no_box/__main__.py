@@ -30,8 +30,13 @@ law = "holzapfel_ogden"
 order = 2
 loads = [{kind = "cavity_pressure", facet_set = "endocardium"}]
 supports = [{node_set = "base"}]
-fibres = {rule = "helix", endocardium = "endocardium", epicardium = "epicardium"}
-constants = {kappa = 25.0}
+[fibres]
+rule = "helix"
+angles = [60.0, -60.0]
+endocardium = "endocardium"
+epicardium = "epicardium"
+[constants]
+kappa = 25.0
 [parameters]
 a = {unit = "kPa", range = [0.2, 0.52], scale = "log"}
 b = {unit = "", range = [1.0, 4.2], scale = "log"}
@@ -45,7 +50,7 @@ pressure = {unit = "kPa", range = [0.53, 1.33]}
 class Body:
     """What is measured of one body.
 
-    scene : a built-in scene; None for the coarse ventricle of 583 nodes.
+    scene : a built-in scene; None for the coarse ventricle of 615 nodes.
     observe, noise, known : as in an experiment file. sets : the number of data sets.
     """
 
