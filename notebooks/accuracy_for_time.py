@@ -283,5 +283,4 @@ plt.show()
 # - A posterior, or many patients' data on one mesh: an emulator. `calibrate train SCENE --recipe mechanics` takes a minute or
 #   two.
 # - A doubt about the emulator: a certificate. It takes a hundred FEM runs; a chain with a Newton step inside takes thousands.
-# - A poor map and no better one: `calibrate infer --error-runs` puts the map's error into the likelihood, which widens the
-#   posterior. A better map is worth more.
+# - A poor map: `calibrate infer --forward rounds` makes a better one, from FEM runs where the posterior is.

@@ -216,8 +216,7 @@ assert second.verdict != "accepted"
 # %% [markdown]
 # Landmarks that differ by so little are enough: ten of them, known to 0.3 mm, pin `mu` down more closely than the mesh
 # deserves. The certificate says by how much and in which direction, without knowing the truth. What it says next is the remedy:
-# an emulator of the finer mesh from a few runs on it (`calibrate train finer:SCENE --recipe two_meshes`), or the mesh's error in
-# the likelihood (`--mesh-error`), which widens the posterior.
+# to infer on the finer mesh (`calibrate infer finer:SCENE`), by FEM runs where the posterior is.
 #
 # So: check the sampler and the emulator as above, which costs minutes, leave the mesh in the certificate, and check the model
 # against data that no mesh has made.

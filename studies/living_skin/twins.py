@@ -72,7 +72,7 @@ def twins_of(
             except em.SolverError:
                 continue
         u = jnp.stack(fields)[:, truth_of.observe.nodes]
-        means = truth_of.fem_means(key, draw, truth_of.observe(u, thetas))
+        means = truth_of.means_with_errors(key, draw, truth_of.observe(u, thetas))
         data = {
             name: np.asarray(mean) + truth_of.noise[name].simulate(rng, np.shape(mean))
             for name, mean in means.items()
@@ -147,7 +147,7 @@ def inclusion_twin(
     u = jnp.stack(fields)[:, model.observe.nodes]
     draw = {name: jnp.asarray(0.0) for name in model.names}
     draw |= {name: jnp.asarray(value) for name, value in truth.items()}
-    means = model.fem_means(key, draw, model.observe(u, model.states.thetas(draw)))
+    means = model.means_with_errors(key, draw, model.observe(u, model.states.thetas(draw)))
     data = {
         name: np.asarray(mean) + model.noise[name].simulate(rng, np.shape(mean))
         for name, mean in means.items()

@@ -100,7 +100,7 @@ _WIDER = 1.3  # factor by which Student's t is wider than the estimated covarian
 
 
 At = Callable[[jax.Array, ModelError, jax.Array], jax.Array]
-"""The function of x (q,), the shared errors and their unknowns (m,) that returns the information F
+"""The function of x (q,), the shared errors and their size () that returns the information F
 (q, q)."""
 
 
@@ -128,11 +128,10 @@ def information_at(model: Model, observe: Observations, noise: Mapping[str, Nois
         means, _ = predicted(thetas)
         return ravel_pytree(means)[0], means
 
-    def at(x: jax.Array, error: ModelError, sizes: jax.Array) -> jax.Array:
+    def at(x: jax.Array, error: ModelError, size: jax.Array) -> jax.Array:
         J, means = jax.jacfwd(data, has_aux=True)(x)
-        unknowns = jnp.concatenate([model.from_scales(x), sizes])
         about_means = information_about_means(noise, means)
-        return times(J.T, error.information_left(about_means, unknowns, means)) @ J
+        return times(J.T, error.information_left(about_means, size, means)) @ J
 
     return at
 
@@ -181,7 +180,7 @@ def expected_precision(
         information_of = information_at(model, model.observe, model.noise)
         mean = np.array([float(at[name]) for name in names])
         x = model.on_scales(mean)
-        by_size = jax.jit(jax.vmap(lambda sizes: information_of(x, error, sizes)))(sizes_of(error))
+        by_size = jax.jit(jax.vmap(lambda size: information_of(x, error, size)))(sizes_of(error))
         covariances = np.linalg.inv(np.asarray(by_size) + np.linalg.inv(before))
     sd = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)).mean(axis=0)
     ratio = sd / np.sqrt(np.diagonal(before))
@@ -212,32 +211,27 @@ class _DataPrograms:
         """Return the data without noise, and whether the map has an answer."""
         return self.model.predict(self._values(x))
 
-    def _log_likelihood(self, x: jax.Array, answer: Any, data: Any, error: ModelError) -> jax.Array:
+    def _log_likelihood(self, answer: Any, data: Any, error: ModelError) -> jax.Array:
         means, valid = answer
         residual = {name: data[name] - mean for name, mean in means.items()}
         log_density = self.model.log_density({}, means, data)
-        log_density += log_ratio(error, self.model.from_scales(x), residual, means)
+        log_density += log_ratio(error, residual, means)
         return without_nan(jnp.where(valid, log_density, -jnp.inf))
 
-    def _log_likelihoods(
-        self, x: jax.Array, answers: Any, data: Any, error: ModelError
-    ) -> jax.Array:
-        def one(point: tuple[jax.Array, Any]) -> jax.Array:
-            return self._log_likelihood(*point, data, error)
-
-        return jax.lax.map(one, (x, answers), batch_size=_BATCH)
+    def _log_likelihoods(self, answers: Any, data: Any, error: ModelError) -> jax.Array:
+        one = partial(self._log_likelihood, data=data, error=error)
+        return jax.lax.map(one, answers, batch_size=_BATCH)
 
     def _data_set(self, inputs: tuple[Any, ...]) -> tuple[Any, jax.Array, jax.Array]:
         """Return data made at x (q,), F (q, q), and the log likelihood's slope (q,) there."""
-        x, means, error, sizes, key = inputs
+        x, means, error, size, key = inputs
         noise_key, error_key = jax.random.split(key)
-        unknowns = jnp.concatenate([self.model.from_scales(x), sizes])
-        means = error.draw(error_key, unknowns, means)
+        means = error.draw(error_key, size, means)
         parts = self.model.distributions({}, means)
         keys = jax.random.split(noise_key, len(parts))
         data = {n: d.sample(k) for (n, d), k in zip(parts.items(), keys, strict=True)}
-        slope = jax.grad(lambda x: self._log_likelihood(x, self._answer(x), data, error))(x)
-        return data, self._information(x, error, sizes), slope
+        slope = jax.grad(lambda x: self._log_likelihood(self._answer(x), data, error))(x)
+        return data, self._information(x, error, size), slope
 
 
 @kept
@@ -269,9 +263,9 @@ def _posterior_covariances(
             inside = np.asarray(programs.log_priors(z))
             # The map may be undefined at points of prior density 0, so x takes their place.
             z = np.where(np.isfinite(inside)[:, None], z, x)
-            return Heights(inside, programs.log_likelihoods(z, programs.answers(z), data, error))
+            return Heights(inside, programs.log_likelihoods(programs.answers(z), data, error))
 
-        likelihood = programs.log_likelihoods(shared, answers, data, error)
+        likelihood = programs.log_likelihoods(answers, data, error)
         points = PosteriorPoints(
             z=shared, at=Heights(log_prior, likelihood), priors=len(shared),
             log_kernels=np.zeros((0, len(shared))), log_densities=log_densities,
@@ -341,21 +335,15 @@ def _stacked(arrays: Sequence[Any]) -> np.ndarray:
 
 
 def sizes_of(error: ModelError, count: int = _SIZES) -> jax.Array:
-    """Return equally probable sizes (count, 1) of the error; (count, 0) if its size is known."""
+    """Return equally probable sizes (count,) of the error, 1 if its size is known."""
     prior = next(iter(error.priors.values()), None)
-    if prior is None:
-        return jnp.zeros((count, 0))
-    return prior.icdf((jnp.arange(count) + 0.5) / count)[:, None]
+    return jnp.ones(count) if prior is None else prior.icdf((jnp.arange(count) + 0.5) / count)
 
 
-def log_ratio(error: ModelError, theta: jax.Array, residual: Means, means: Means) -> jax.Array:
-    """Return an error's share () of the log likelihood of ``residual`` at ``theta`` (q,)."""
-    sizes = sizes_of(error) if error.priors else jnp.zeros((1, 0))
-
-    def at(size: jax.Array) -> jax.Array:
-        return error.log_ratio(jnp.concatenate([theta, size]), residual, means)
-
-    log_ratios = jax.vmap(at)(sizes)
+def log_ratio(error: ModelError, residual: Means, means: Means) -> jax.Array:
+    """Return an error's share () of the log likelihood of ``residual``."""
+    sizes = sizes_of(error, _SIZES if error.priors else 1)
+    log_ratios = jax.vmap(lambda size: error.log_ratio(size, residual, means))(sizes)
     return logsumexp(log_ratios) - jnp.log(len(sizes))
 
 
@@ -391,7 +379,7 @@ def next_measurement(
         information_of = jax.jit(information_at(model, Observations({name: part}), {name: noise}))
         gains, ratios = [], []
         for k in rows:
-            information = np.asarray(information_of(jnp.asarray(x[k]), ModelError(), jnp.zeros(0)))
+            information = np.asarray(information_of(jnp.asarray(x[k]), ModelError(), jnp.ones(())))
             precision = np.eye(len(root)) + root.T @ information @ root
             gains.append(0.5 * np.linalg.slogdet(precision)[1] / np.log(2.0))
             after = root @ np.linalg.solve(precision, root.T)

@@ -311,8 +311,8 @@ def misfits(
     def discrepancies(flat: jax.Array, draw: dict[str, jax.Array], key: jax.Array) -> Any:
         means = model.observe.unravel(flat)
         parts = model.distributions(draw, means)
-        key, mesh_key = jax.random.split(key)
-        errors = jax.tree.map(jnp.subtract, model.fem_means(mesh_key, draw, means), means)
+        key, error_key = jax.random.split(key)
+        errors = jax.tree.map(jnp.subtract, model.means_with_errors(error_key, draw, means), means)
         keys = jax.random.split(key, len(parts))
         by_name = {}
         for (name, distribution), key in zip(parts.items(), keys, strict=True):

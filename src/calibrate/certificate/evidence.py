@@ -29,8 +29,6 @@ LARGEST_MASS = {0.05: 0.06, 0.5: 0.12, 0.95: 0.06}
 # Beyond these changes by a finer mesh the posterior is about the mesh and not about the tissue.
 LARGEST_MESH_SHIFT = 0.5
 LARGEST_MESH_LOG_SD = float(np.log(1.25))
-# For a likelihood that allows for the mesh: the finer mesh's mean is inside the 90 % interval.
-LARGEST_WIDENED_SHIFT = 1.5
 # Monte Carlo errors between a figure and its limit. Runs are doubled while they do not decide, and
 # fresh points test at each look, so errors are independent: at 2.4 a figure that is at its limit is
 # called within it at one of three looks with a probability of 1 - 0.9918^3 = 2.4 %, of five 4 %.
@@ -115,7 +113,6 @@ class MeshChange(Changes):
     nodes : the number of nodes of the finer mesh.
     runs, failed : the numbers of solves on the finer mesh, and of those that did not converge.
     linear : whether the coarser mesh has linear elements.
-    widened : whether the likelihood allows for the error of the mesh.
     gripped : whether the finer mesh is of a specimen between its grips.
     why : the reason for which no finer mesh was solved; empty if one was.
     homogeneous : of a specimen without grips, in words, who says that it deforms evenly.
@@ -125,7 +122,6 @@ class MeshChange(Changes):
     runs: int = 0
     failed: int = 0
     linear: bool = False
-    widened: bool = False
     gripped: bool = False
     why: str = ""
     homogeneous: str = ""
@@ -138,9 +134,8 @@ class MeshChange(Changes):
 
     def comparisons(self) -> list[Comparison]:
         """Return every figure with its limit."""
-        largest = LARGEST_WIDENED_SHIFT if self.widened else LARGEST_MESH_SHIFT
         return [
-            *((f"mean of {n} would move by {f.value:+.2f} sd", f, largest)
+            *((f"mean of {n} would move by {f.value:+.2f} sd", f, LARGEST_MESH_SHIFT)
               for n, f in self.shift.items()),
             *((f"sd of {n} would change by a factor of {np.exp(f.value):.2f}", f,
                LARGEST_MESH_LOG_SD) for n, f in self.log_sd.items()),

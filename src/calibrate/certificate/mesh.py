@@ -123,8 +123,7 @@ def mesh_change(
         total=points[1] * states, desc="finer mesh", disable=not progress, unit="solve"
     ) as bar:
         differences = _differences_of_fem(predictive, finer, bar)
-        widened = predictive.model.error.of_mesh
-        change = change_by(differences, pool, runs, points, rng, deadline=deadline, widened=widened)
+        change = change_by(differences, pool, runs, points, rng, deadline=deadline)
     finer.forget()
     return replace(
         change,
@@ -171,19 +170,17 @@ def change_by(
     rng: np.random.Generator,
     *,
     deadline: float = np.inf,
-    widened: bool = False,
 ) -> MeshChange:
     """Return the changes of the corrected posterior by ``differences`` at a few points.
 
     points : the numbers of points that may decide and that end it, see :func:`points_for`.
-    widened : whether the likelihood allows for the error of the mesh.
     """
     correction_by = _corrections_by(pool.predictive, runs)
     enough, most = points
     z, D = _at_draws(differences, pool, _FEWEST, rng, pool.z[:0])
     asked, fine = _FEWEST, pool
     while True:
-        change = MeshChange(runs=asked, failed=asked - len(z), widened=widened)
+        change = MeshChange(runs=asked, failed=asked - len(z))
         if len(z) >= _FEWEST:
             correction, of_mesh = correction_by(z, D)
             fine = fine.corrected_by(correction).polished(rng, _ROUNDS, cheap=False)

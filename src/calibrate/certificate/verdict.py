@@ -17,7 +17,12 @@ from calibrate.certificate.evidence import (
     all_within,
 )
 from calibrate.posterior.box import in_words
-from calibrate.posterior.diagnosis import SMALLEST_P, map_fault, sampling_faults
+from calibrate.posterior.diagnosis import (
+    SMALLEST_P,
+    closer_map,
+    map_fault,
+    sampling_faults,
+)
 from calibrate.posterior.taken_up import REMEDY
 from emulator.core.display import TableRepr
 
@@ -39,17 +44,16 @@ SMALLEST_POOL = 200.0  # effective points under the corrected map
 _MANY = 20.0  # factor in the number of runs above which the estimate of that factor is worthless
 
 _MORE = "more FEM runs (--until decided)"
-_WIDEN = "or allow for it in the likelihood (--mesh-error)"
-_QUADRATIC = f"make the elements quadratic (order = 2), {_WIDEN}"
+_REFINE = "infer on the finer mesh (calibrate infer finer:SCENE)"
+_QUADRATIC = f"make the elements quadratic (order = 2), or {_REFINE}"
 _LEARN_GRIPS = (
     "calibrate on the gripped piece (calibrate train SCENE --out grips.safetensors, then learned = "
-    f'"grips.safetensors" under [grips] of the scene), {_WIDEN}'
+    '"grips.safetensors" under [grips] of the scene)'
 )
 _SAY_GRIPS = (
     'clamps make a square 10 to 20 % stiffer; give [grips] in the scene file, or grips = "none" '
     "where they are far from what was measured"
 )
-_REFINE = f"emulate the finer mesh (calibrate train finer:SCENE --recipe two_meshes), {_WIDEN}"
 
 Finding = tuple[str, str]
 """A statement about the posterior, and a remedy; empty where there is none."""
@@ -192,16 +196,13 @@ def _mesh(mesh: MeshChange) -> tuple[bool | None, list[Finding]]:
         worst = max(abs(figure.value) for figure in mesh.shift.values())
         row = "grips" if mesh.gripped else "mesh"
         words = f"{row}: {finer} no mean would move by more than {worst:.2f} posterior sd"
-        return True, [(f"{words}, which is widened for it" if mesh.widened else words, "")]
+        return True, [(words, "")]
     decisive = [w for w, figure, limit in comparisons if figure.within(limit) is within]
     if within is None:
         close = f"{finer} the {decisive[0]}, too close to the limit for its error"
         return None, [(close, f"give more runs there (--mesh-runs {2 * mesh.runs})")]
     remedy = _QUADRATIC if mesh.linear else _REFINE
-    if mesh.gripped:
-        remedy = _LEARN_GRIPS
-    elif mesh.widened:
-        remedy = "learn the error of the mesh from more runs, or emulate the finer mesh"
+    remedy = _LEARN_GRIPS if mesh.gripped else remedy
     return False, _together([f"{finer} the {decisive[0]}", *decisive[1:]], remedy)
 
 
@@ -213,8 +214,8 @@ def _together(words: list[str], remedy: str) -> list[Finding]:
 
 def _agreement(evidence: Evidence) -> tuple[Verdict, list[Finding]]:
     """Return verdict and findings on the draws against FEM."""
-    tail, draws = evidence.tail, evidence.draws
-    if (verdict_of_weights := _weights(tail)) is not None:
+    draws, closer = evidence.draws, closer_map(evidence.forward)
+    if (verdict_of_weights := _weights(evidence.tail, closer)) is not None:
         return verdict_of_weights
     agree = all_within(comparisons := draws.comparisons())
     if agree:
@@ -232,19 +233,21 @@ def _agreement(evidence: Evidence) -> tuple[Verdict, list[Finding]]:
         words = [words for words, _, _ in decisive]
         return "reweight", _together(words, "use the reweighted posterior")
     verdict: Verdict = "undecided" if repaired is None else "not certified"
-    remedy = _MORE if repaired is None else "train a better map"
+    remedy = _MORE if repaired is None else closer
     first, *others = (words for words, _, _ in decisive)
     return verdict, _together([f"{first}, and reweighting does not repair it", *others], remedy)
 
 
-def _weights(tail: Tail) -> tuple[Verdict, list[Finding]] | None:
-    """Return verdict and finding where the weights of the FEM runs forbid any other figure."""
+def _weights(tail: Tail, closer: str) -> tuple[Verdict, list[Finding]] | None:
+    """Return verdict and finding where the weights of the FEM runs forbid any other figure.
+
+    closer : the remedy where the map is too far from FEM.
+    """
     if tail.ess == 0.0:
         return "not certified", [("no FEM run supports the posterior", "check map and FEM options")]
     if tail.spread > LARGEST_SPREAD:
         apart = f"the map differs from FEM irregularly, log ratios spread by {tail.spread:.1f}"
-        remedy = "train a better map, or put FEM into the likelihood"
-        return "not certified", [(apart, remedy)]
+        return "not certified", [(apart, f"{closer}, or put FEM into the likelihood")]
     if np.isnan(tail.k_hat) and not tail.spread <= _SAME:
         few = "too few FEM runs to judge the tail of their weights"
         return "undecided", [(few, "100 FEM runs or more")]
@@ -261,7 +264,7 @@ def _weights(tail: Tail) -> tuple[Verdict, list[Finding]] | None:
             f"{tail.missed} FEM runs are likely where the corrected map says they are not, so the "
             "map may hide a part of the posterior"
         )
-        return "undecided", [(hidden, f"train a better map, or {_MORE}")]
+        return "undecided", [(hidden, f"{closer}, or {_MORE}")]
     return None
 
 

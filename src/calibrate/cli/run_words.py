@@ -32,7 +32,7 @@ NoiseWord = float | dict[str, Any]
 
 MODEL = (
     "data", "truth", "known", "observe", "prior", "bounded", "noise", "noise_scale",
-    "check_scale", "forward", "emulator", "error_runs", "mesh_error_runs", "load_steps",
+    "check_scale", "forward", "emulator", "load_steps",
 )  # fmt: skip
 """Fields of a run that say which posterior is meant, besides its scene (:func:`add_scene`) and the
 forward map's options (:func:`add_forward`); ``systematic`` errors need an experiment file."""
@@ -70,7 +70,6 @@ def _add_run(parser: ArgumentParser, more: Sequence[str]) -> None:
 
     add_scene(parser, "; or an experiment file, whose entries the options replace")
     parser.set_defaults(fields=(*MODEL, *more))
-    exclusive = parser.add_mutually_exclusive_group()
     hints, texts = get_type_hints(Run), documented(Run)
     for field in fields(Run):
         name, default = field.name, field.default
@@ -98,9 +97,8 @@ def _add_run(parser: ArgumentParser, more: Sequence[str]) -> None:
                 about, text = {"choices": tuple(SAMPLERS)}, f"default {default}"
             elif hints[name] is int:
                 about = {"type": int, "metavar": "N"}
-            group = exclusive if name.endswith("error_runs") else parser
             flag = word.flag or f"--{name.replace('_', '-')}"
-            group.add_argument(flag, dest=name, help=text, **about)
+            parser.add_argument(flag, dest=name, help=text, **about)
 
 
 def plan_of(arguments: Namespace) -> Run | Problem | Members:
@@ -243,7 +241,6 @@ WORDS = {
         help="take data however far from every prediction (m for mm, mm3 for mL, zero)",
     ),
     "emulator": Word("NAME|DIR"),
-    "mesh_error_runs": Word(flag="--mesh-error"),
     "sampler_options": Word(
         "NAME=VALUE",
         "e.g. target_accept=0.95, rounds=2; an unknown name lists the sampler's",

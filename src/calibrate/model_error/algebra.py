@@ -58,18 +58,19 @@ def marginalised(terms: Sequence[Term], information: np.ndarray) -> ModelError:
 
     information : information W of the noise about the data's means, (d, d), or its diagonal (d,).
     """
+    if not terms:
+        return ModelError()
     constant = [term for term in terms if term.size is None and term.shares is None]
     others = [term for term in terms if term.size is not None or term.shares is not None]
     first = _together(constant, information)
-    before = () if all(term.is_learned for term in terms) else (first,)
     if not others:
-        return ModelError(before)
+        return ModelError((first,))
     if all(term.shares is None for term in others):
         second = _together(others, information, first)
-        return ModelError((*before, replace(second, mixing=None)))
+        return ModelError((first, replace(second, mixing=None)))
     left = information
     if constant:
-        left = np.asarray(ModelError(before).information_left(jnp.asarray(left), jnp.zeros(0), {}))
+        left = np.asarray(ModelError((first,)).information_left(jnp.asarray(left), 1.0, {}))
     sized = [
         np.full(len(t.modes), t.size is not None) if t.sized is None else t.sized for t in others
     ]
@@ -79,9 +80,8 @@ def marginalised(terms: Sequence[Term], information: np.ndarray) -> ModelError:
         next((term.size for term in others if term.size is not None), None),
         1.0 * np.concatenate(sized),
         information=left,
-        of_mesh=any(term.of_mesh for term in others),
     )
-    return ModelError((*before, together))
+    return ModelError((first, together))
 
 
 def _together(terms: Sequence[Term], information: np.ndarray, before: Term | None = None) -> Term:

@@ -7,12 +7,11 @@ with the unknowns x, the predicted data g of all observations (d numbers), the i
 noise (d, d), or its diagonal, and the modes of each term in the unit of the data: what one standard
 deviation of each :math:`z_{ki}` changes,
 
-.. math:: V_k(x) = \alpha_k(x)\, \left(A_k + B_k \circ g(x)\right).
+.. math:: V_k(x) = \alpha_k\, \left(A_k + B_k \circ g(x)\right).
 
-A :class:`Term` declares A, B and the size :math:`\alpha`: 1, or a function of the unknowns learned
-from FEM runs (:class:`Amplitude`), or a number that is inferred under a half-normal prior
-(:class:`~calibrate.noise.protocol.Scale`). Modes B are shares of the prediction, such as a load
-cell's gain.
+A :class:`Term` declares A, B and the size :math:`\alpha`: 1, or a number that is inferred under a
+half-normal prior (:class:`~calibrate.noise.protocol.Scale`). Modes B are shares of the prediction,
+such as a load cell's gain.
 
 Elimination without exchanges, :math:`I + V W V^T = L P L^T` with pivots P and a unit lower
 triangular L, gives all that is needed. With the reduced rows :math:`R = L^{-1} V W` the log
@@ -36,7 +35,7 @@ be fitted too low by the factor :math:`1 + (n - 1) s^2` (Peelle's puzzle; D'Agos
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -47,53 +46,17 @@ from jax.flatten_util import ravel_pytree
 
 from calibrate.noise.protocol import Scale
 from emulator.core.errors import InputError
-from emulator.core.gaussian_process import kernel_mean
 from emulator.core.small_matrices import eliminate
 from emulator.surrogates.protocol import fingerprint_of
 
 Means = Mapping[str, jax.Array]
 """Data without noise by the observation's name."""
 
-LEARNED = "the size of the forward map's error is learned"
-"""The words of an error message for a size that is a function of the unknowns."""
-
 _SIZED, _VARYING = "sized_", "varying_"  # prefixes of the arrays of a second term
 _DIAGONAL = ("weights", "strength", "modes", "mixing")  # arrays of a term that is diagonal, and
 _DENSE = ("modes", "shares", "sized", "information")  # of one that is not
 # Recorded in saved errors, because in earlier versions shares were of the data.
 _SHARES = "of the prediction"
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
-class Amplitude:
-    r"""Size of the errors as a function of the unknowns, by kernel regression on its logarithm.
-
-    .. math:: \log\alpha(x) = \sum_j w_j \log\alpha_j, \qquad
-              w_j \propto \exp\left(-\tfrac12 |x - x_j|^2 / h^2\right)
-
-    x : the standardised unknowns (n, q) of the FEM runs.
-    log_sizes : the logarithm of the size of each run's error, (n,).
-    width : the kernel's width h, in standardised unknowns.
-    centre, scale : mean and standard deviation (q,) by which the unknowns are standardised.
-    """
-
-    x: np.ndarray
-    log_sizes: np.ndarray
-    width: float
-    centre: np.ndarray
-    scale: np.ndarray
-
-    def __call__(self, unknowns: jax.Array) -> jax.Array:
-        """Return the size, (), at ``unknowns`` (q,): between the least and greatest of the runs."""
-        at = (unknowns - self.centre) / self.scale
-        squared = jnp.sum(((at - self.x) / self.width) ** 2, axis=-1)
-        return jnp.exp(kernel_mean(squared, self.log_sizes))
-
-    @property
-    def upper(self) -> float:
-        """The greatest size of the runs."""
-        return float(np.exp(np.max(self.log_sizes)))
 
 
 @jax.tree_util.register_dataclass
@@ -111,53 +74,41 @@ class Term:
         modes that no datum could tell from nothing; ``None`` where the declared ones are forgotten.
     information : W, (d, d), or its diagonal (d,), where they are not.
     names : names of the unknowns z of the declared modes of a systematic error.
-    of_mesh : whether modes of a learned size were learned on a finer mesh.
     """
 
     modes: np.ndarray
     shares: np.ndarray | None = None
-    size: Amplitude | Scale | None = None
+    size: Scale | None = None
     sized: np.ndarray | None = None
     weights: Any = None
     strength: Any = None
     mixing: Any = None
     information: np.ndarray | None = None
     names: tuple[str, ...] = jax.tree.static(default=())
-    of_mesh: bool = jax.tree.static(default=False)
-
-    @property
-    def is_learned(self) -> bool:
-        """True for errors of the forward map, which are learned from FEM runs."""
-        return isinstance(self.size, Amplitude)
 
     @property
     def unknown_size(self) -> str:
         """The words of an error message for a size that is not known; empty for a size of 1."""
-        if isinstance(self.size, Scale):
-            return f"the size '{self.size.name}' is inferred (scale {self.size.prior_scale:g})"
-        return LEARNED if self.is_learned else ""
+        if self.size is None:
+            return ""
+        return f"the size '{self.size.name}' is inferred (scale {self.size.prior_scale:g})"
 
-    def alpha(self, unknowns: jax.Array) -> Any:
-        """Return the size, (), at ``unknowns``, of which an inferred one is the last."""
-        if isinstance(self.size, Scale):
-            return unknowns[-1]
-        return 1.0 if self.size is None else self.size(unknowns)
-
-    def at(self, alpha: Any, means: jax.Array) -> jax.Array:
-        """Return V (r, d) where the size is ``alpha`` and the prediction ``means`` (d,)."""
+    def at(self, size: Any, means: jax.Array) -> jax.Array:
+        """Return V (r, d) at the inferred ``size``, if there is one, and the prediction (d,)."""
+        alpha = 1.0 if self.size is None else size
         if self.sized is not None:
             alpha = jnp.where(self.sized > 0.0, alpha, 1.0)[:, None]
         modes = jnp.asarray(self.modes)
         return alpha * (modes if self.shares is None else modes + self.shares * means)
 
     def eliminated(
-        self, unknowns: jax.Array, means: jax.Array, columns: jax.Array
+        self, size: Any, means: jax.Array, columns: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """Return the pivots P (r,), and R ``columns`` (r, m) of columns (d, m)."""
-        alpha = self.alpha(unknowns)
         if self.strength is not None:
+            alpha = 1.0 if self.size is None else size
             return 1.0 + alpha**2 * self.strength, alpha * (self.weights @ columns)
-        V = self.at(alpha, means)
+        V = self.at(size, means)
         VW = times(V, self.information)
         return eliminate(VW @ V.T + jnp.eye(len(V)), VW @ columns)
 
@@ -181,60 +132,33 @@ class ModelError:
         )
 
     @property
-    def systematic(self) -> ModelError:
-        """The errors that are not learned from FEM runs."""
-        terms = [term for term in self.terms if not term.is_learned]
-        for term in self.terms:
-            if term.is_learned and term.sized is not None:
-                rows = {n: getattr(term, n)[term.sized == 0.0] for n in _DENSE[:3]}
-                terms.append(replace(term, **rows, size=None))
-        return ModelError(tuple(terms))
-
-    @property
-    def of_fem(self) -> ModelError:
-        """The errors by which data differ from FEM on the map's mesh, too."""
-        return self if self.of_mesh else self.systematic
-
-    @property
-    def is_learned(self) -> bool:
-        """True if one of the terms is of the forward map, learned from FEM runs."""
-        return isinstance(self.size, Amplitude)
-
-    @property
-    def of_mesh(self) -> bool:
-        """Whether errors were learned on a finer mesh, so that they are the mesh's as well."""
-        return any(term.is_learned and term.of_mesh for term in self.terms)
-
-    @property
     def names(self) -> tuple[str, ...]:
-        """Names of the unknowns z of systematic errors of known size, without shares."""
+        """Names of the unknowns z of errors of known size, without shares."""
         return self.terms[0].names if self.terms else ()
 
     @property
-    def size(self) -> Amplitude | Scale | None:
+    def size(self) -> Scale | None:
         """The size that is not known, of which there is one at most."""
         return next((term.size for term in self.terms if term.size is not None), None)
 
     @property
     def priors(self) -> dict[str, dist.Distribution]:
         """Prior of the size that is inferred, by its name in the posterior; empty if none is."""
-        return self.size.priors if isinstance(self.size, Scale) else {}
+        return {} if self.size is None else self.size.priors
 
-    def log_ratio(self, unknowns: jax.Array, residual: Means, means: Means) -> jax.Array:
+    def log_ratio(self, size: Any, residual: Means, means: Means) -> jax.Array:
         """Return what the errors add to the log likelihood of ``residual``, data less ``means``.
 
-        unknowns : theta's unknowns (q,), then the size of :attr:`priors` if one is inferred.
+        size : the inferred size of :attr:`priors`, (); of no effect where there is none.
         """
         total, means_flat = jnp.zeros(()), ravel_pytree(dict(means))[0]
         column = ravel_pytree(dict(residual))[0][:, None]
         for term in self.terms:
-            pivots, rows = term.eliminated(unknowns, means_flat, column)
+            pivots, rows = term.eliminated(size, means_flat, column)
             total += 0.5 * jnp.sum(rows[:, 0] ** 2 / pivots - jnp.log(pivots))
         return total
 
-    def information_left(
-        self, information: jax.Array, unknowns: jax.Array, means: Means
-    ) -> jax.Array:
+    def information_left(self, information: jax.Array, size: Any, means: Means) -> jax.Array:
         """Return what is left of the noise's ``information`` about ``means``, (d, d).
 
         It is the inverse covariance of the data given the unknowns. How the covariance itself
@@ -245,24 +169,25 @@ class ModelError:
         flat = ravel_pytree(dict(means))[0]
         left = jnp.diag(information) if information.ndim == 1 else information
         for term in self.terms:
-            pivots, rows = term.eliminated(unknowns, flat, jnp.eye(len(information)))
+            pivots, rows = term.eliminated(size, flat, jnp.eye(len(information)))
             left = left - (rows.T / pivots) @ rows
         return left
 
-    def draw(self, rng_key: jax.Array, unknowns: jax.Array, means: Means) -> dict[str, jax.Array]:
+    def draw(self, rng_key: jax.Array, size: Any, means: Means) -> dict[str, jax.Array]:
         """Return data without noise that might have come: ``means`` plus a draw of the errors."""
         flat, unravel = ravel_pytree(dict(means))
         keys = jax.random.split(rng_key, len(self.terms)) if self.terms[1:] else [rng_key]
         perturbed = flat
         for key, term in zip(keys, self.terms, strict=False):
-            V = term.at(term.alpha(unknowns), flat)
+            V = term.at(size, flat)
             perturbed += jax.random.normal(key, (len(V),)) @ V
         return unravel(perturbed)
 
     def largest(self, means: Means) -> np.ndarray:
-        """Return V (r, d) beside data like ``means``, each size as large as is plausible."""
+        """Return V (r, d) beside data like ``means``, the size as large as is plausible."""
         flat = ravel_pytree(dict(means))[0]
-        rows = [term.at(term.size.upper if term.size else 1.0, flat) for term in self.terms]
+        upper = 1.0 if self.size is None else self.size.upper
+        rows = [term.at(upper, flat) for term in self.terms]
         return np.concatenate([np.zeros((0, len(flat))), *rows])
 
     def unknowns(self, residual: Means) -> tuple[np.ndarray, np.ndarray]:
@@ -295,16 +220,12 @@ class ModelError:
             kind, prefix = (_DENSE, _VARYING) if term.strength is None else (_DIAGONAL, _SIZED)
             prefix = prefix if arrays else ""
             arrays |= {f"{prefix}{name}": getattr(term, name) for name in kind}
-        arrays |= vars(self.size) if isinstance(self.size, Amplitude) else {}
         arrays["size_scale"] = getattr(self.size, "prior_scale", None)
-        arrays["of_mesh"] = self.of_mesh or None
         return {name: np.asarray(value) for name, value in arrays.items() if value is not None}
 
     @property
     def words(self) -> dict[str, Any]:
-        """The plain JSON that :meth:`restore` needs besides arrays; empty for learned errors."""
-        if self.terms[0].mixing is None:
-            return {}
+        """The plain JSON that :meth:`restore` needs besides arrays."""
         return {"names": self.names, "size": next(iter(self.priors), ""), "shares": _SHARES}
 
     @classmethod
@@ -318,7 +239,7 @@ class ModelError:
         TypeError
             An array is missing, or one is unknown.
         """
-        if words and words.get("shares") != _SHARES:
+        if words.get("shares") != _SHARES:
             raise InputError(
                 "the posterior is older than systematic errors that are shares of predictions; "
                 "infer again"
@@ -328,15 +249,12 @@ class ModelError:
             prefix = next((p for p in (_SIZED, _VARYING) if name.startswith(p)), "")
             groups[prefix][name.removeprefix(prefix)] = array
         first, *others = groups.values()
-        of_mesh, scale = first.pop("of_mesh", None) is not None, first.pop("size_scale", None)
-        learned = {f.name: first.pop(f.name) for f in fields(Amplitude) if f.name in first}
+        scale = first.pop("size_scale", None)
         if missing := set(_DIAGONAL[:3]) - set(first):
             raise TypeError(f"{', '.join(missing)} is missing")
-        size: Any = None if scale is None else inferred_size(words.get("size", ""), float(scale))
-        if learned:
-            size = Amplitude(**{**learned, "width": float(learned["width"])})
+        size = None if scale is None else inferred_size(words.get("size", ""), float(scale))
         terms = [Term(**group) for group in (first, *others) if group]
-        terms[-1] = replace(terms[-1], size=size, of_mesh=of_mesh)
+        terms[-1] = replace(terms[-1], size=size)
         terms[0] = replace(terms[0], names=tuple(words.get("names", ())))
         return cls(tuple(terms))
 

@@ -176,11 +176,10 @@ def _all_data(name: str, tree: xr.DataTree) -> xr.DataTree:
         raise InputError(f"{name} has no log likelihoods; sample it with predictions")
     if tree.attrs.get("forward_error") not in (None, "null"):
         systematic = json.loads(tree.attrs.get("run", "{}")).get("systematic")
-        learned = "its forward map's error (--error-runs; in Python it may be a systematic one)"
-        what = f"systematic errors ({', '.join(systematic)})" if systematic else learned
+        named = f" ({', '.join(systematic)})" if systematic else ""
         raise InputError(
-            f"{name} allows for {what}, which log likelihoods of single data leave out; sample it "
-            "without"
+            f"{name} allows for systematic errors{named}, which log likelihoods of single data "
+            "leave out; sample it without"
         )
     parts = [
         np.asarray(values).reshape(*values.shape[:2], -1)

@@ -123,15 +123,18 @@ def map_fault(
         f"{value:.2g} {unit}" if np.isfinite(value) else "an unknown amount"
         for value, unit in ((sizes[worst], "noise sd"), (moves, "sd"))
     )
-    closer = FORWARD_MAPS.get(forward, CORRECTED).closer
     consequence = f", and FEM in its place would move a mean by {most}"
     most = consequence if moves > LARGEST_MAP_MOVE else ""
     return (
         f"the forward map misses FEM by {size} in {worst} at the draws{most}",
-        f"infer with {closer}, or let the map's error widen the posterior (--error-runs N)"
-        if closer
-        else "let the map's error widen the posterior (--error-runs N)",
+        closer_map(forward),
     )
+
+
+def closer_map(forward: str) -> str:
+    """Return the remedy where a map of this kind is too far from FEM."""
+    closer = FORWARD_MAPS.get(forward, CORRECTED).closer
+    return f"infer with {closer}" if closer else "check the options of FEM"
 
 
 class Summary(dict[str, dict[str, float]]):

@@ -154,20 +154,16 @@ def _prior(model: Model, rng_key: jax.Array, prediction: Prediction | None = Non
 def _log_likelihood(
     model: Model, draw: Data, means: Data | None, data: Data
 ) -> dict[str, jax.Array]:
-    if means is not None:
-        around = model.distributions(draw, means)
-        return {name: _pointwise(d, data[name]) for name, d in around.items()}
-    trace = model.trace(draw, data)
-    sites = {name: trace[_site(name)] for name in model.observe.parts}
-    return {name: _pointwise(site["fn"], site["value"]) for name, site in sites.items()}
+    around = model.distributions(draw, model.predict(draw)[0] if means is None else means)
+    return {name: _pointwise(d, data[name]) for name, d in around.items()}
 
 
 def _replicate(
     model: Model, draw: Data, means: Data | None, rng_key: jax.Array
 ) -> dict[str, jax.Array]:
     if means is not None:
-        fem_key, *keys = jax.random.split(rng_key, len(means) + 1)
-        around = model.distributions(draw, model.fem_means(fem_key, draw, means))
+        error_key, *keys = jax.random.split(rng_key, len(means) + 1)
+        around = model.distributions(draw, model.means_with_errors(error_key, draw, means))
         return {name: d.sample(k) for (name, d), k in zip(around.items(), keys, strict=True)}
     seeded = handlers.substitute(handlers.seed(model, rng_key), data=dict(draw))
     trace = handlers.trace(seeded).get_trace()

@@ -17,15 +17,17 @@ _LEAST_LOG_SD = float(np.log(2.0))
 _WIDTH = 3.72  # sd to each side of a median that hold all but 2e-4 of the mass
 
 
-def wide_prior(scene: ForwardProblem, bounded: Collection[str] = ()) -> Population | None:
+def wide_prior(scene: ForwardProblem, without: Collection[str] = ()) -> Population | None:
     """Return log-normals of the parameters above zero; None where there is none.
 
     A range that somebody thought possible is one sd of the logarithm to each side of its middle,
-    and a factor of 2 at least. A parameter whose range is ``bounded`` by nature keeps it.
+    and a factor of 2 at least.
+
+    without : the parameters that get none, as their range is nature's or their value is known.
     """
     median, log_sd = dict[str, float](), dict[str, float]()
     for k, parameter in enumerate(scene.parameters):
-        if parameter.low > 0.0 and parameter.name not in bounded:
+        if parameter.low > 0.0 and parameter.name not in without:
             median[parameter.name] = float(scene.centre[k])
             half = 0.5 * float(np.log(parameter.high / parameter.low))
             log_sd[parameter.name] = max(half, _LEAST_LOG_SD)
@@ -35,19 +37,28 @@ def wide_prior(scene: ForwardProblem, bounded: Collection[str] = ()) -> Populati
     return Population(median, log_sd, source=source)
 
 
-def as_wide(
-    prior: str | Mapping[str, Any], scene: ForwardProblem, bounded: Collection[str]
-) -> tuple[str | dict[str, Any], ForwardProblem]:
-    """Return a run's prior in numbers, wide where it states none, and the scene as wide as it.
+Words = str | Mapping[str, Any]
+"""A run's prior, in words or numbers."""
 
-    Parameters
-    ----------
-    prior : the run's words or numbers. bounded : the parameters whose range nature ends.
+
+def as_wide(prior: Words, scene: ForwardProblem, bounded: Collection[str]) -> ForwardProblem:
+    """Return the scene as wide as :func:`in_numbers` of all of its parameters.
+
+    bounded : the parameters whose range nature ends.
     """
     population = completed(population_called(prior), wide_prior(scene, bounded))
-    if population is None:
-        return BOX, scene
-    return asdict(population), widened(with_mesh(scene), population)
+    return scene if population is None else widened(with_mesh(scene), population)
+
+
+def in_numbers(
+    prior: Words, scene: ForwardProblem, without: Collection[str]
+) -> str | dict[str, Any]:
+    """Return a run's prior in numbers, wide where it states none, of a ``scene`` not yet widened.
+
+    without : the parameters that have none, unless it is stated.
+    """
+    population = completed(population_called(prior), wide_prior(scene, without))
+    return BOX if population is None else asdict(population)
 
 
 def completed(stated: Population | None, wide: Population | None) -> Population | None:

@@ -33,6 +33,7 @@ from calibrate.project.results import (
     is_of,
     read_posterior,
     reserved,
+    run_of,
 )
 from calibrate.project.run import Run
 from calibrate.samplers.auto import AUTO
@@ -160,8 +161,7 @@ def read_members(folder: str | Path) -> tuple[Members, Hierarchy]:
         raise InputError(f"{folder} holds a single run; calibrate.load reads it")
     entries, where = read_json(folder / RUN), folder / RUN
     runs = {
-        name: schema.read_as(Run, run, f"{where}, member '{name}'")
-        for name, run in entries[MEMBERS].items()
+        name: run_of(run, f"{where}, member '{name}'") for name, run in entries[MEMBERS].items()
     }
     shared = schema.read_as(Shared, entries.get(POPULATION, {}), f"{where}, {POPULATION}")
     plan, path = Members(runs, shared), folder / POSTERIOR

@@ -21,10 +21,10 @@ from calibrate.measurements import Observations, parse_observation
 from calibrate.measurements.data import read_measurements
 from calibrate.measurements.usual_noise import size_in, usual_noise
 from calibrate.priors import prior_of
-from calibrate.priors.wide import as_wide
+from calibrate.priors.wide import as_wide, in_numbers
 from calibrate.project.run import Run
 from calibrate.state_names import split
-from calibrate.statistical_model import Model, with_error
+from calibrate.statistical_model import Model
 from calibrate.statistical_model.errors import with_described_errors
 from calibrate.statistical_model.load_states import boxed, known_thetas, load_states
 from calibrate.statistical_model.model import model
@@ -124,9 +124,9 @@ def read_problem(
         if scene is None:
             scene = find_problem(run.scene, run.root)
             table = scene.table
-        if run.forward == ROUNDS.name:
-            wide, scene = as_wide(run.prior, scene, run.bounded)
-            run = replace(run, prior=wide)
+        narrow, by_rounds = scene, run.forward == ROUNDS.name
+        if by_rounds:
+            scene = as_wide(run.prior, scene, run.bounded)
         if run.is_synthetic:
             names = {**run.known, **run.truth}
             states = tuple(dict.fromkeys(state for _, state in map(split, names) if state))
@@ -140,6 +140,8 @@ def read_problem(
                         "it; say it once"
                     )
             run = replace(run, known={**in_files, **run.known})
+        if by_rounds:
+            run = replace(run, prior=in_numbers(run.prior, narrow, {*run.bounded, *run.known}))
         run = run.named(observe, scene)
         run.noises(observe)
         prior = prior_of(run.prior, scene)
@@ -243,16 +245,6 @@ def build_model(
     run_model = model_of(run, forward, problem.observe)
     if run.systematic:
         run_model, data = with_described_errors(run_model, data, run.systematic)
-    if runs := run.error_runs or run.mesh_error_runs:
-        run_model, data = run_model.given(data)
-        run_model = with_error(
-            replace(run_model, check_scale=False),  # the data has been checked
-            problem.simulator,
-            runs,
-            of_mesh=bool(run.mesh_error_runs),
-            seed=run.seed,
-            progress=progress,
-        )
     return run_model, data
 
 
@@ -260,4 +252,4 @@ def by_fem(model: Model, load_steps: int = 1) -> Model:
     """Return ``model`` with FEM as its forward map, to make data for checks of the model."""
     whole = by_solver(simulator_of(model.forward.scene, load_steps), model.full)
     forward = whole.at(model.observe.nodes)
-    return replace(model, full=whole, forward=forward, error=model.error.of_fem)
+    return replace(model, full=whole, forward=forward)

@@ -4,7 +4,7 @@
 ``run.json``             the :class:`~calibrate.project.run.Run`
 ``data.csv``             its data
 ``forward.safetensors``  the forward map, where it was fitted for this run
-``error.safetensors``    the errors besides noise that the likelihood allows for, if any
+``error.safetensors``    the systematic errors that the likelihood allows for, if any
 ``posterior.nc``         the posterior, as ArviZ reads it
 ``certificate.json``     what FEM says of the posterior, once it is certified
 ``report.html``          the page, once it is written
@@ -39,6 +39,8 @@ from calibrate.project.run import Run
 from emulator.catalogue import find_problem
 from emulator.core import schema
 from emulator.core.errors import InputError
+from emulator.core.line_index import Path as Place
+from emulator.core.line_index import json_lines
 from emulator.core.store import exclusive, read_arrays, read_json, save_arrays, write_json
 from emulator.surrogates import registry
 from emulator.surrogates.taught import ROUNDS
@@ -53,6 +55,7 @@ MEMBERS = "members"  # entry of a population's members in run.json, and folder o
 
 _RESULTS = (REPORT, CERTIFICATE, POSTERIOR, FORWARD, ERROR)  # files of a run that has ended
 _PLACES = ("scene", "root", "emulator")  # may change: fingerprints identify the content
+_LEARNED = ("error_runs", "mesh_error_runs")  # entries of earlier versions' runs
 _DESCRIPTION = "systematic"  # metadata of a file of systematic errors
 _DATA_HASH = "data_sha256"  # attribute of a posterior: the SHA-256 of its data file
 _SHOWN = 4  # largest number of a folder's files that an error names
@@ -92,8 +95,7 @@ def _replace_results(folder: Path, problem: Problem, posterior: Posterior) -> No
         write_json(new / RUN, run)
         registry.keep_forward(posterior.model.full, new / FORWARD)
         if (error := posterior.model.error).terms:
-            metadata = {_DESCRIPTION: json.dumps(error.words)} if error.words else {}
-            save_arrays(new / ERROR, error.arrays(), metadata)
+            save_arrays(new / ERROR, error.arrays(), {_DESCRIPTION: json.dumps(error.words)})
         posterior.tree.attrs |= {"run": json.dumps(run), _DATA_HASH: _hash(new / DATA)}
         posterior.save(new / POSTERIOR)
         # Earlier results go first and the posterior comes last: a run that is killed leaves no
@@ -146,14 +148,15 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
         raise InputError(
             f"{folder} holds a population; name one of its members, {folder / MEMBERS}/NAME"
         )
-    run = schema.read_json_as(Run, folder / RUN)
+    entries, lines = read_json(folder / RUN), json_lines((folder / RUN).read_text("utf-8"))
+    run = run_of(entries, str(folder / RUN), lines)
     scene = find_problem(run.scene, run.root)
     if run.forward == ROUNDS.name:
-        scene = as_wide(run.prior, scene, run.bounded)[1]
+        scene = as_wide(run.prior, scene, run.bounded)
     tree = read_tree(path)
     if tree.attrs.get("scene_fingerprint") != scene.fingerprint:
         raise InputError(f"{path} was made for another scene than '{run.scene}'")
-    _check_run(path, tree, read_json(folder / RUN))
+    _check_run(path, tree, entries)
     kept = tree.attrs.get(_DATA_HASH)  # runs of earlier versions have none
     if kept and (folder / DATA).is_file() and kept != _hash(folder / DATA):
         raise InputError(
@@ -169,10 +172,9 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
             f"{forward.fingerprint} now); infer again"
         )
     observe = observations_from_json(scene, json.loads(tree.attrs["observe"]))
-    has_error = run.error_runs or run.mesh_error_runs or run.systematic
     run_model = replace(
         model_of(run, forward, observe),
-        error=_read_error(folder / ERROR, path, tree) if has_error else ModelError(),
+        error=_read_error(folder / ERROR, path, tree) if run.systematic else ModelError(),
         check_scale=False,  # the data was checked when it was sampled, or the check was overruled
     )
     observed = tree["observed_data"]
@@ -180,6 +182,21 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
         {n: np.asarray(observed[n]).reshape(shape) for n, shape in observe.shapes.items()}
     )
     return run, Posterior(tree, run_model, data)
+
+
+def run_of(entries: Any, where: str, lines: Mapping[Place, int] = {}) -> Run:
+    """Return the run of ``entries``, read from the file ``where``, whose ``lines`` they are on.
+
+    Earlier versions learned errors of the map and of the mesh: a run with one is refused.
+    """
+    runs = {n: entries.get(n) for n in _LEARNED} if isinstance(entries, dict) else {}
+    for name in [name for name, count in runs.items() if count]:
+        raise InputError(
+            f"{where}: {name} is {runs[name]}, but errors are no longer learned; infer again, with "
+            "--forward rounds where the map misses FEM, and finer:SCENE where the mesh does"
+        )
+    present = {n: v for n, v in entries.items() if n not in runs} if runs else entries
+    return schema.read_as(Run, present, where, lines)
 
 
 def _hash(path: Path) -> str:

@@ -177,7 +177,8 @@ def by_rounds(problem: Problem) -> Problem:
     named = run.forward != EMULATOR.name or run.emulator is not None
     if named or not isinstance(scene, Scene):
         return problem
-    if scene.name in shipped() and scene.origin.get("scene") != "file":  # a file may have its name
+    # A scene file may have the name of a shipped one, and finer:NAME and wider:NAME do.
+    if scene.name in shipped() and scene.origin.get("scene") == scene.name:
         return problem
     return read_problem(replace(run, forward=ROUNDS.name), scene=scene)
 
@@ -191,8 +192,7 @@ def taught_map(problem: Problem, **options: Any) -> TaughtEmulator | None:
     if run.forward != ROUNDS.name:
         return None
     at_rest = Emulator(with_mesh(problem.scene)).cache()
-    bare = replace(problem, run=replace(run, error_runs=0, mesh_error_runs=0))
-    model, data = build_model(bare, at_rest)
+    model, data = build_model(problem, at_rest)
     model, data = replace(model, check_scale=False).given(data)
     most = registry.full_options(ROUNDS.name, run.forward_options)["most_runs"]
     simulator = cast(Simulator, problem.simulator)

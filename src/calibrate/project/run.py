@@ -70,10 +70,6 @@ class Run:
     emulator : shipped name or folder of the emulator that the map is built from, or the kind of
         one shipped for the scene, ``series`` or ``physics``; by default its graph network.
     forward_options : the map's options by name, e.g. ``{"fem_runs": 60}``.
-    error_runs : FEM runs (8 or more) from which the forward map's own error is learned, so that a
-        poor map widens the posterior instead of moving it; 0 takes the map as exact.
-    mesh_error_runs : the same with solves on the next finer mesh, so that the error of the mesh
-        widens the posterior, too.
     load_steps : load steps in which every FEM solve follows the loading path from rest; 1 solves
         at the full load.
     sampler : a name of :data:`calibrate.samplers.SAMPLERS`.
@@ -99,8 +95,6 @@ class Run:
     forward: str = "emulator"
     emulator: str | None = None
     forward_options: dict[str, Any] = field(default_factory=dict)
-    error_runs: int = 0
-    mesh_error_runs: int = 0
     load_steps: int = 1
     sampler: str = "auto"
     sampler_options: dict[str, Any] = field(default_factory=dict)
@@ -113,15 +107,11 @@ class Run:
         registry.full_options(self.forward, self.forward_options)
         registry.check_words(self.forward, emulator=self.emulator)
         least = dict.fromkeys(("warmup", "draws", "chains", "load_steps"), 1)
-        for name in (*least, "error_runs", "mesh_error_runs", "seed"):
+        for name in (*least, "seed"):
             if (value := getattr(self, name)) < least.get(name, 0):
                 raise InputError(f"{name} is {value}; it must be {least.get(name, 0)} or more")
         if self.truth and self.data != SYNTHETIC:
             raise InputError(f"truth has no effect beside data file {self.data}; leave one out")
-        if self.error_runs and self.mesh_error_runs:
-            raise InputError(
-                "error_runs and mesh_error_runs are both given; the latter see the map's error, too"
-            )
         for name, description in self.systematic.items():
             read_systematic(name, description)
 

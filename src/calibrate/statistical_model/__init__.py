@@ -1,7 +1,6 @@
-"""The statistical model around a forward map, and what it allows for."""
+"""The statistical model around a forward map."""
 
-from calibrate.statistical_model.errors import with_error
 from calibrate.statistical_model.fem_likelihood import FEMLikelihood
 from calibrate.statistical_model.model import Data, Model, at_sites
 
-__all__ = ["Data", "FEMLikelihood", "Model", "at_sites", "with_error"]
+__all__ = ["Data", "FEMLikelihood", "Model", "at_sites"]

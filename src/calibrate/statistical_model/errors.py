@@ -1,24 +1,7 @@
-r"""Models whose data have errors besides noise: declared, described in a run, or learned from FEM.
+"""Systematic errors of a model's data, and how far its forward map is from FEM.
 
 The errors themselves, and how they are integrated out, are in :mod:`calibrate.model_error`. They
 need Gaussian noise of known standard deviation, whose information they are marginalised beside.
-
-**Learned.** The forward map's data :math:`g(x)` differ from FEM's by :math:`e(x) = g_\text{FEM}(x)
-- g(x)`. The error is treated as noise whose covariance depends on the unknowns x, so that a poor
-map widens the posterior,
-
-.. math:: y = g(x) + e(x) + \varepsilon, \qquad
-          e(x) \sim N\left(0,\ \alpha(x)^2\, A^T A\right)
-
-(the approximation error of Kaipio and Somersalo 2007, with a size that varies). It is learned from
-n FEM runs at draws of the prior: :math:`\alpha(x_j) \propto |W^{1/2} e_j|`, with W the information
-of the noise about its mean, is interpolated between the runs by a Gaussian kernel on
-:math:`\log \alpha`, its width chosen by leaving runs out; and :math:`A^T A` is the mean of
-:math:`e_j e_j^T / \hat\alpha_{-j}(x_j)^2`, with each run's size predicted from the others, so that
-sizes that are hard to predict make the error larger.
-
-The error has no mean: it does not correct the map, it says how far to believe it. Where the runs
-were on a finer mesh, the error is the mesh's as well, and FEM on the mesh is allowed the same.
 """
 
 from __future__ import annotations
@@ -35,29 +18,21 @@ from jax.flatten_util import ravel_pytree
 
 from calibrate.model_error.algebra import check_algebra, marginalised
 from calibrate.model_error.kinds import Measurement, read_systematic
-from calibrate.model_error.marginal import LEARNED, Amplitude, ModelError, Term, times
+from calibrate.model_error.marginal import ModelError, Term
 from calibrate.model_error.systematic import Systematic
 from calibrate.noise import information_about_means
-from calibrate.statistical_model.fem_likelihood import FEMLikelihood
-from calibrate.statistical_model.finer_fem import finer_fem
 from calibrate.statistical_model.model import Model
 from calibrate.statistical_model.moves import FEMAnswer, largest_move
 from calibrate.statistical_model.predictive import Predictive, noise_sds
 from emulator.accuracy.estimate import newton_distance
-from emulator.accuracy.mesh_error import MeshErrorEstimate
-from emulator.core.display import counting
-from emulator.core.errors import InputError, SolverError
-from emulator.core.gaussian_process import kernel_mean
+from emulator.core.errors import InputError
 from emulator.fem import Simulator
 from emulator.fem.compiled import compiled
-from emulator.fem.solution import EquilibriumSolver
 
-FEWEST = 8  # FEM runs from which an error is learned
-_MODES = 12
+_WHAT = "systematic errors"  # the beginning of messages
 _STEPS = 12  # Newton steps of a round that tell the map's error, over all load states
 _FEWEST_ANSWERS = 4  # points of a round, and FEM runs where Newton steps are refused
 _CLOUD = 1024  # draws that points are put around
-_WIDTHS = np.geomspace(0.05, 2.0, 12)  # kernel widths in standardised unknowns
 
 
 def with_systematic(model: Model, *errors: Systematic) -> Model:
@@ -72,7 +47,7 @@ def with_systematic(model: Model, *errors: Systematic) -> Model:
     if not errors:
         raise InputError("systematic errors: give one or more")
     terms = [error.term(model.observe.shapes) for error in errors]
-    return replace(model, error=_joined(model, "systematic errors", terms))
+    return replace(model, error=_joined(model, terms))
 
 
 def with_described_errors(
@@ -101,7 +76,7 @@ def errors_of_data(
     :class:`InputError` where an error does not fit, by its name; and as :func:`with_systematic`.
     """
     kinds = {name: read_systematic(name, description) for name, description in descriptions.items()}
-    check_algebra("systematic errors", model.noise)
+    check_algebra(_WHAT, model.noise)
     parameters = model.forward.scene.parameter_names
     states = zip(model.states.states, model.states.entries, strict=True)
     theta = {state: dict(zip(parameters, row, strict=True)) for state, row in states}
@@ -116,99 +91,23 @@ def errors_of_data(
                 terms.append(error.term(model.observe.shapes))
             except InputError as wrong:
                 raise InputError(f"systematic '{name}': {wrong}") from wrong
-        return _joined(model, "systematic errors", terms)
+        return _joined(model, terms)
 
     return error_of
 
 
-def _joined(model: Model, what: str, terms: Sequence[Term]) -> ModelError:
+def _joined(model: Model, terms: Sequence[Term]) -> ModelError:
     """Return the errors of ``model``'s data and these terms together, integrated out.
 
-    :class:`InputError`, which begins with ``what``, where they lack a property that this needs.
+    :class:`InputError` where they lack a property that this needs.
     """
     every = (*model.error.declarations, *terms)
-    check_algebra(what, model.noise, {term.unknown_size for term in every} - {""})
-    error = marginalised(every, _information(model))
-    if taken := error.priors.keys() & replace(model, error=ModelError()).names:
-        raise InputError(f"{what}: a size is called '{taken.pop()}', as an unknown of the model")
-    return error
-
-
-def _information(model: Model) -> np.ndarray:
-    """Return the information (d, d) of the noise about the data's means, or its diagonal (d,)."""
+    check_algebra(_WHAT, model.noise, {term.unknown_size for term in every} - {""})
     means = {name: jnp.zeros(shape) for name, shape in model.observe.shapes.items()}
-    return np.asarray(information_about_means(model.noise, means))
-
-
-def with_error(
-    model: Model,
-    simulator: EquilibriumSolver,
-    runs: int = 24,
-    *,
-    of_mesh: bool = False,
-    seed: int = 0,
-    progress: bool = False,
-) -> Model:
-    """Return ``model`` whose likelihood allows for the forward map's own error.
-
-    FEM is solved at ``runs`` draws of the prior, from the map's predictions.
-
-    Parameters
-    ----------
-    of_mesh : whether to solve on the next finer mesh of the body, or a specimen between its grips,
-        so that this error is allowed for, too.
-    seed : the seed from which the draws of the prior are drawn.
-
-    Raises
-    ------
-    InputError
-        Fewer than 8 runs, the simulator of another scene, noise that is not Gaussian or of unknown
-        sd, no finer mesh (:func:`~emulator.accuracy.mesh_error.mesh_error`), or fewer than 8 draws
-        at which both FEM and the map have an answer.
-    """
-    if runs < FEWEST:
-        raise InputError(f"error of the forward map: {runs} FEM runs; give {FEWEST} or more")
-    if simulator.scene.fingerprint != model.forward.scene.fingerprint:
-        raise InputError("error of the forward map: the simulator is for another scene")
-    systematic = model.error.systematic.declarations
-    sizes = {LEARNED, *(term.unknown_size for term in systematic)} - {""}
-    check_algebra("error of the forward map", model.noise, sizes)
-    predict = jax.jit(model.predict)
-    fem = FEMLikelihood(model, simulator)
-    finer = finer_fem(model, simulator) if of_mesh else None
-    known: list[MeshErrorEstimate] = []
-
-    def solve(draw: Mapping[str, Any]) -> np.ndarray | None:
-        """Return FEM's data, flat (m,); None where it does not converge."""
-        if finer is not None:
-            try:
-                pair = finer(draw, known)
-            except SolverError:
-                return None
-            known.extend(pair.estimates)
-            return pair.fine
-        if (solved := next(fem.equilibria([draw]))[1]) is None:
-            return None
-        seen = jnp.stack([field.displacement[model.observe.nodes] for field in solved])
-        return np.asarray(ravel_pytree(model.observe(seen, model.states.thetas(draw)))[0])
-
-    draws = model.prior_draws(jax.random.key(seed), runs)
-    unknowns, errors = [], []
-    what = "error of map and mesh" if of_mesh else "error of the map"
-    for k in counting(range(runs), what, disable=not progress, unit="run"):
-        values = {name: draw[k] for name, draw in draws.items()}
-        means, valid = predict(values)
-        if bool(valid) and (exact := solve(values)) is not None:
-            errors.append(exact - np.asarray(ravel_pytree(means)[0]))
-            unknowns.append([float(values[name]) for name in model.states.unknowns])
-    if len(errors) < FEWEST:
-        raise InputError(
-            f"error of the forward map: FEM and the map answered at {len(errors)} of {runs} draws "
-            f"of the prior; {FEWEST} are needed"
-        )
-    information = _information(model)
-    term = fit(np.array(unknowns), np.array(errors), information, of_mesh=of_mesh)
-    return replace(model, error=marginalised([*systematic, term], information))
+    error = marginalised(every, np.asarray(information_about_means(model.noise, means)))
+    if taken := error.priors.keys() & replace(model, error=ModelError()).names:
+        raise InputError(f"{_WHAT}: a size is called '{taken.pop()}', as an unknown of the model")
+    return error
 
 
 class MapErrors(NamedTuple):
@@ -245,7 +144,7 @@ def map_errors(
     data : the data by the observation's name.
     """
     # Equations of a body that is loaded at rest are of two displacements: at rest, and from there.
-    if simulator.scene.loaded_by or model.error.is_learned:
+    if simulator.scene.loaded_by:
         return NOT_ASKED
     distance = compiled(partial(newton_distance, simulator.system))
     observe, predict, means = model.observe, jax.jit(model.full), jax.jit(model.means)
@@ -269,7 +168,7 @@ def map_errors(
         error = np.asarray(ravel_pytree(exact)[0] - ravel_pytree(means(thetas)[0])[0])
         if not np.isfinite(error).all():
             return None
-        height = float(model.fem_log_likelihood(draw, exact, data))
+        height = float(model.log_likelihood(draw, exact, data))
         return FEMAnswer(z, error, height) if np.isfinite(height) else None
 
     def ask(points: np.ndarray, runs: int) -> tuple[list[FEMAnswer], bool]:
@@ -304,46 +203,15 @@ def in_noise_sd(
 ) -> dict[str, float]:
     """Return the size of the map's errors in noise sd, by the observation's name.
 
-    Root mean squares over its numbers, medians over draws; empty if the likelihood allows for them.
+    Root mean squares over its numbers, medians over draws; empty if there are none.
 
     errors : the map's data less FEM's at draws, flat (s, m).
     draws : draws (s,) by the unknown's name, of which an inferred noise sd is taken.
     """
-    if not len(errors) or model.error.is_learned:
+    if not len(errors):
         return {}
     sizes, sds = {}, noise_sds(model, draws)
     for name, values in jax.vmap(model.observe.unravel)(jnp.asarray(errors)).items():
         square = np.square(np.asarray(values).reshape(len(errors), -1))
         sizes[name] = float(np.median(np.sqrt(square.mean(axis=1))) / sds[name])
     return sizes
-
-
-def fit(
-    unknowns: np.ndarray, errors: np.ndarray, information: np.ndarray, *, of_mesh: bool = False
-) -> Term:
-    """Fit the forward map's error to FEM runs.
-
-    unknowns : the unknowns at which FEM was run, (n, q).
-    errors : FEM's data less the map's, all observations raveled, (n, d).
-    information : the information W of the noise about its mean, (d, d), or its diagonal (d,).
-    of_mesh : whether FEM was run on a finer mesh.
-    """
-    centre, scale = unknowns.mean(axis=0), np.maximum(unknowns.std(axis=0), 1e-12)
-    x = (unknowns - centre) / scale
-    norms = np.sqrt(np.sum(times(errors, information) * errors, axis=1))
-    log_sizes = np.log(np.maximum(norms, 1e-12 * max(float(norms.max()), 1e-300)))
-    width = min(
-        _WIDTHS, key=lambda w: float(np.mean((_left_out(x, log_sizes, w) - log_sizes) ** 2))
-    )
-    sizes = np.exp(_left_out(x, log_sizes, width))[:, None]
-    size = Amplitude(x, log_sizes, float(width), centre, scale)
-    (term,) = marginalised([Term(errors / sizes / np.sqrt(len(x)), size=size)], information).terms
-    largest = np.argsort(-term.strength)[:_MODES]
-    return Term(term.modes[largest], size=size, of_mesh=of_mesh)
-
-
-def _left_out(x: np.ndarray, values: np.ndarray, width: float) -> np.ndarray:
-    """Return leave-one-out predictions of ``values`` (n,) at ``x`` (n, q) by kernel regression."""
-    squared = np.sum((x[:, None] - x[None]) ** 2, axis=-1) / width**2
-    np.fill_diagonal(squared, np.inf)
-    return np.asarray(kernel_mean(squared, values))

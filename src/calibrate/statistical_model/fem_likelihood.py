@@ -1,7 +1,6 @@
 """FEM's log likelihood at draws of a posterior, beside the cheap map's.
 
-It serves certificates and learned errors of a map, and is the only place that solves FEM for a
-draw.
+It is the only place that solves FEM for a draw.
 """
 
 from __future__ import annotations
@@ -27,10 +26,9 @@ from emulator.scenes.scene import Scene
 class Likelihoods(NamedTuple):
     """Log likelihoods of the data at one draw.
 
-    fem : the log likelihood with FEM's displacement, and with the error of its mesh if the model
-        allows for one; ``-inf`` where FEM did not converge in a load state.
-    cheap : the log likelihood with the model's forward map, and with its error if the model allows
-        for one; ``-inf`` where the map has no answer.
+    fem : the log likelihood with FEM's displacement; ``-inf`` where FEM did not converge in a load
+        state.
+    cheap : the log likelihood with the model's forward map; ``-inf`` where it has no answer.
     converged : whether FEM converged in every load state.
     smallest_J : smallest volume ratio det F in the body, by FEM; NaN where it did not converge.
     means : FEM's data without noise, by the observation's name; empty where it did not converge.
@@ -214,6 +212,6 @@ class FEMLikelihood:
     def _by_fem(self, fields: jax.Array, thetas: jax.Array, draw: Data, data: Data) -> Any:
         """Return the log likelihood, the means and the smallest volume ratio."""
         means = self.model.observe(fields[:, self.model.observe.nodes], thetas)
-        value = self.model.fem_log_likelihood(draw, means, data)
+        value = self.model.log_likelihood(draw, means, data)
         ratios = [volume_ratio(self.simulator.scene, u) for u in fields]
         return value, means, jnp.min(jnp.stack(ratios))

@@ -24,7 +24,6 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 from jax.flatten_util import ravel_pytree
-from numpyro import handlers
 
 from calibrate import mend_numpyro
 from calibrate.measurements import Observation, Observations, leave_out_missing, observations
@@ -64,8 +63,7 @@ class Model:
         name share its unknown scales.
     states : the source of each entry of theta in each load state.
     prior : the prior of each unknown of theta.
-    error : errors of the data besides noise: the forward map's own, or systematic ones of the
-        measurement.
+    error : systematic errors of the data, besides noise.
     prior_cut : the mass of each prior that was cut off, by unknown (``prior_range``).
     check_scale : whether :meth:`check_data` refuses data far from every prediction.
     dependence : the dependence between the priors of some unknowns, in theta's order.
@@ -201,9 +199,9 @@ class Model:
         observed = None if data is None else self.observe.name(data, "data")
         if self.error.terms:
             if observed is None:
-                means = self.error.draw(numpyro.prng_key(), self._stacked(draw), means)
+                means = self.means_with_errors(numpyro.prng_key(), draw, means)
             else:
-                numpyro.factor("error", self._ratio(self.error, draw, means, observed))
+                numpyro.factor("error", self._log_ratio(draw, means, observed))
         for name, distribution in self.distributions(draw, means).items():
             obs = None if observed is None else observed[name]
             numpyro.sample(f"observed_{name}", distribution, obs=obs)
@@ -277,40 +275,31 @@ class Model:
         parts = self.distributions(draw, means)
         return sum((d.log_prob(data[name]) for name, d in parts.items()), jnp.zeros(()))
 
-    def fem_log_likelihood(self, draw: Mapping[str, Any], means: Data, data: Data) -> jax.Array:
-        """Return the log density of ``data``, (), around FEM's ``means`` at ``draw``.
+    def log_likelihood(self, draw: Mapping[str, Any], means: Data, data: Data) -> jax.Array:
+        """Return the log density of ``data``, (), around ``means`` with noise and errors."""
+        return self.log_density(draw, means, data) + self._log_ratio(draw, means, data)
 
-        Where the likelihood allows for errors of the mesh or of the measurement, FEM has them, too.
-        """
-        ratio = self._ratio(self.error.of_fem, draw, means, data)
-        return self.log_density(draw, means, data) + ratio
-
-    def fem_means(self, rng_key: jax.Array, draw: Mapping[str, Any], means: Data) -> Data:
-        """Return FEM's ``means`` at ``draw``, plus a draw of the errors that FEM has, too."""
-        return self.error.of_fem.draw(rng_key, self._stacked(draw), means)
+    def means_with_errors(
+        self, rng_key: jax.Array, draw: Mapping[str, Any], means: Data
+    ) -> dict[str, jax.Array]:
+        """Return ``means`` plus a draw of the errors, of the size that ``draw`` has."""
+        return self.error.draw(rng_key, self._error_size(draw), means)
 
     def map_log_likelihood(self, draw: Mapping[str, Any], data: Data) -> jax.Array:
-        """Return the log density of ``data``, (), with the forward map and its errors.
+        """Return the log density of ``data``, (), around what the forward map predicts.
 
         It is ``-inf`` where the map has no answer. ``draw`` has a number for each of :attr:`names`.
         """
-        observed = [site for site in self.trace(draw, data).values() if site.get("is_observed")]
-        return sum((jnp.sum(s["fn"].log_prob(s["value"])) for s in observed), jnp.zeros(()))
+        means, valid = self.predict(draw)
+        return jnp.where(valid, self.log_likelihood(draw, means, data), -jnp.inf)
 
-    def trace(self, draw: Mapping[str, Any], data: Data) -> dict[str, dict[str, Any]]:
-        """Return NumPyro's sites of the program at ``draw`` (a number by name) and ``data``."""
-        return handlers.trace(handlers.substitute(self, data=dict(draw))).get_trace(data)
-
-    def _ratio(
-        self, error: ModelError, draw: Mapping[str, Any], means: Data, data: Data
-    ) -> jax.Array:
+    def _log_ratio(self, draw: Mapping[str, Any], means: Data, data: Data) -> jax.Array:
         residual = {name: data[name] - mean for name, mean in means.items()}
-        return error.log_ratio(self._stacked(draw), residual, means)
+        return self.error.log_ratio(self._error_size(draw), residual, means)
 
-    def _stacked(self, draw: Mapping[str, Any]) -> jax.Array:
-        """Return theta's unknowns, then the size of errors that is inferred, as one array."""
-        names = (*self.states.unknowns, *self.error.priors)
-        return jnp.stack([jnp.asarray(draw[name], float) for name in names])
+    def _error_size(self, draw: Mapping[str, Any]) -> Any:
+        """Return the size of errors in ``draw``, 1 where none is inferred."""
+        return next((draw[name] for name in self.error.priors), 1.0)
 
     # Its data.
 
@@ -352,7 +341,7 @@ class Model:
         """Return the largest plausible sd of each observation by noise and errors, in its unit."""
         sds = {name: noise.upper_sd for name, noise in self.noise.items()}
         like = {name: jnp.asarray(values) for name, values in data.items()}
-        rows = jnp.asarray(self.error.of_fem.largest(like))
+        rows = jnp.asarray(self.error.largest(like))
         for name, modes in jax.vmap(ravel_pytree(like)[1])(rows).items() if len(rows) else ():
             largest = np.linalg.norm(np.reshape(modes, (len(modes), -1)), 2)
             sds[name] = float(np.hypot(sds[name], largest))

@@ -70,8 +70,8 @@ class Densities(NamedTuple):
     """Log densities at points (s, p), each (s,), ``-inf`` where the density is zero.
 
     prior : the prior density of z, its Jacobian included.
-    cheap : the likelihood that was sampled: the map's, widened for its error where the model is.
-    corrected : the likelihood of the map with its correction, widened for the mesh's error only.
+    cheap : the likelihood that was sampled, the map's.
+    corrected : the likelihood of the map with its correction.
     variance : the variance of the correction, in squared noise sd.
     means : the map's data without noise, flat (s, m); NaN where the map has no answer.
     """
@@ -218,7 +218,7 @@ class Predictive:
     def _curvature(self, z: jax.Array, means: jax.Array, slopes: jax.Array) -> Any:
         def likelihood(z: jax.Array, flat: jax.Array) -> jax.Array:
             draws = self._constrain(z)
-            return self.model.fem_log_likelihood(draws, self.model.observe.unravel(flat), self.data)
+            return self.model.log_likelihood(draws, self.model.observe.unravel(flat), self.data)
 
         J = jax.jacfwd(lambda z: self.model.states.thetas(self._constrain(z)))(z)
         J = jnp.tensordot(slopes, J, axes=2)
@@ -264,7 +264,7 @@ class Predictive:
         def one(z: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
             draws = self._constrain(z)
             means, valid = self.model.predict(draws)
-            cheap = self.model.map_log_likelihood(draws, self.data)
+            cheap = self.model.log_likelihood(draws, means, self.data)
             flat = jnp.where(valid, ravel_pytree(means)[0], jnp.nan)
             cheap = without_nan(jnp.where(valid, cheap, -jnp.inf))
             return without_nan(self._density.log_prior(z)), cheap, flat
@@ -277,6 +277,6 @@ class Predictive:
             draws = self._constrain(point[0])
             step, variance = correct(correction, self._features(draws))
             means = self.model.observe.unravel(point[1] + step)
-            return without_nan(self.model.fem_log_likelihood(draws, means, self.data)), variance
+            return without_nan(self.model.log_likelihood(draws, means, self.data)), variance
 
         return jax.lax.map(one, (z, means), batch_size=BATCH)

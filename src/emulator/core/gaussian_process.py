@@ -83,17 +83,6 @@ CORRELATIONS: dict[str, Callable[[Any], Any]] = {
 """Correlation functions that options call by name."""
 
 
-def kernel_mean(squared: Any, values: Any) -> Any:
-    """Return the mean (...) of ``values`` (n,), each weighted by its squared exponential.
-
-    It lies between the least and the greatest value (Nadaraya 1964, Watson 1964).
-
-    squared : the squared scaled distances (..., n).
-    """
-    weights = squared_exponential(squared - squared.min(axis=-1, keepdims=True))
-    return weights @ values / weights.sum(axis=-1)
-
-
 class Regression(NamedTuple):
     """The regression on n observations; it computes with NumPy where its arrays are NumPy's.
 

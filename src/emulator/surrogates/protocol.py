@@ -178,4 +178,6 @@ class ForwardKind:
     to_arrays: Callable[[ForwardMap], Arrays] | None = None
     from_arrays: Callable[[Any, Arrays], ForwardMap] | None = None
     words: tuple[str, ...] = ()
-    closer: str = "--forward corrected (or more of its --steps)"
+    closer: str = (
+        "--forward rounds (FEM where the posterior is) or corrected (or more of its --steps)"
+    )

@@ -126,4 +126,5 @@ ROUNDS = ForwardKind(
     (Option("most_runs", 64, "FEM runs, each in every load state, at most", least=8),),
     _to_arrays,
     _from_arrays,
+    closer="more runs (--most-runs N)",
 )

@@ -162,8 +162,7 @@ def test_a_wrong_map_is_named_before_the_chains_that_disagree_on_it():
         "the forward map misses FEM by 5.2 noise sd in reaction:right:x@s4 at the draws"
     )
     first, *rest = certificate.findings
-    assert "--forward corrected" in first
-    assert "--error-runs N" in first
+    assert "infer with --forward rounds (FEM where the posterior is) or corrected" in first
     assert "the chains disagree, R-hat 1.500: mend the map first" in rest
     assert "draw" not in rest[1].partition(": ")[2]
     assert certificate.to_json()["map_errors"] == wrong

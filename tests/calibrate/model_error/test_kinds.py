@@ -169,7 +169,7 @@ def test_a_hundred_points_of_a_curve_are_not_a_hundred_facts():
         found, _ = with_described_errors(model, data, {"e": words})
         information = np.eye(count) / 1e-6
         means = {name: jnp.asarray(5.0) for name in data}
-        left = found.error.information_left(information, jnp.ones(1), means)
+        left = found.error.information_left(information, 1.0, means)
         sds[count] = float(np.sum(left)) ** -0.5
     assert sds[10] == pytest.approx(0.2, rel=1e-3)
     assert sds[100] == pytest.approx(0.2, rel=1e-3)  # 1e-4 were they a hundred facts
@@ -207,13 +207,14 @@ def test_a_share_that_is_inferred_after_errors_of_known_sds_is_the_dense_covaria
         expected = multivariate_normal(predicted, C).logpdf(values)
         assert float(found.map_log_likelihood(draw, present)) == pytest.approx(expected, rel=1e-6)
         means = {name: jnp.asarray(5.2) for name in data}
-        by_fem = found.fem_log_likelihood(draw, means, present)
+        by_fem = found.log_likelihood(draw, means, present)
         assert float(by_fem) == pytest.approx(expected, rel=1e-6)
-        at_draw = jnp.array([5.2, share])
-        left = found.error.information_left(jnp.eye(4) / 1e-6, at_draw, means)
+        left = found.error.information_left(jnp.eye(4) / 1e-6, share, means)
         np.testing.assert_allclose(left, np.linalg.inv(C), rtol=1e-4, atol=1e-3)
     keys = jax.random.split(jax.random.key(0), 20_000)
-    drawn = jax.vmap(lambda key: jnp.stack(list(found.fem_means(key, draw, means).values())))(keys)
+    drawn = jax.vmap(
+        lambda key: jnp.stack(list(found.means_with_errors(key, draw, means).values()))
+    )(keys)
     np.testing.assert_allclose(np.cov(np.asarray(drawn).T), C - 1e-6 * np.eye(4), atol=0.1)
     # Kept and read again it is the same error.
     back = ModelError.restore(found.error.arrays(), found.error.words)

@@ -10,21 +10,18 @@ from scipy.stats import multivariate_normal
 
 import calibrate as cal
 from calibrate.model_error.algebra import check_algebra, marginalised
-from calibrate.model_error.marginal import LEARNED, Amplitude, ModelError, Term, inferred_size
+from calibrate.model_error.marginal import ModelError, Term, inferred_size
 from emulator.core.errors import InputError
 
 MEANS = {"a": jnp.array([1.0, -2.0]), "b": jnp.array([[3.0, 0.5], [1.5, -1.0]])}
 RESIDUAL = {"a": jnp.array([0.3, 0.1]), "b": jnp.array([[-0.2, 0.4], [0.0, 0.7]])}
 FLAT, R = (np.concatenate([np.ravel(d["a"]), np.ravel(d["b"])]) for d in (MEANS, RESIDUAL))
 RNG = np.random.default_rng(1)
-X = np.array([7.0, 0.4])  # theta's unknown, and the size where one is inferred
+SIZE = 0.4  # where one is inferred
 KNOWN = Term(RNG.normal(size=(3, 6)), names=("k0", "k1", "k2"))
 GAIN = Term(RNG.normal(size=(1, 6)), 0.3 * RNG.normal(size=(1, 6)), names=("gain",))
 SIZED = Term(RNG.normal(size=(4, 6)), size=inferred_size("size", 0.5), names=tuple("abcd"))
 CURVE = replace(SIZED, shares=0.3 * RNG.normal(size=(4, 6)))
-SIZE = Amplitude(RNG.normal(size=(9, 1)), RNG.normal(size=9), 0.3, np.array([7.1]), np.array([0.5]))
-OF_MAP = Term(RNG.normal(size=(2, 6)), size=SIZE)
-OF_MESH = replace(OF_MAP, of_mesh=True)
 SIZES = (0.4, 0.4, 1.0, 0.4)  # of CURVE in rows of which the third has a known size
 LISTS = {
     "known": [KNOWN],
@@ -34,11 +31,6 @@ LISTS = {
     "known and shares": [KNOWN, GAIN, replace(KNOWN, modes=2.0 * KNOWN.modes)],
     "sized shares": [CURVE],
     "all of a measurement": [GAIN, SIZED, KNOWN, CURVE],
-    "map": [OF_MAP],
-    "mesh": [OF_MESH],
-    "known and map": [KNOWN, OF_MAP],
-    "shares and map": [KNOWN, GAIN, OF_MAP],
-    "shares and mesh": [OF_MESH, GAIN],
 }
 
 
@@ -53,44 +45,34 @@ def whole(information):
     return np.diag(information) if information.ndim == 1 else information
 
 
-def dense(terms, x):
+def dense(terms, size):
     """The covariance that the terms add, by hand."""
     S = np.zeros((6, 6))
     for term in terms:
         V = term.modes if term.shares is None else term.modes + term.shares * FLAT
-        if isinstance(term.size, Amplitude):
-            V = V * float(SIZE(jnp.asarray(x[:1])))
-        elif term.size is not None:
-            V = V * x[1]
+        if term.size is not None:
+            V = V * size
         S += V.T @ V
     return S
-
-
-def unknowns(terms, size=X[1]):
-    inferred = any(term.size is not None and not term.is_learned for term in terms)
-    return jnp.array([X[0], size] if inferred else X[:1])
 
 
 @pytest.mark.parametrize("terms", LISTS.values(), ids=LISTS)
 @pytest.mark.parametrize("size", [0.0, 0.4, 2.0])
 def test_the_ratio_and_the_information_are_those_of_dense_covariances(terms, information, size):
     error, C = marginalised(terms, information), np.linalg.inv(whole(information))
-    systematic = [term for term in terms if not term.is_learned]
-    of_fem = terms if OF_MESH in terms else systematic
-    for those, part in ((terms, error), (of_fem, error.of_fem), (systematic, error.systematic)):
-        S, at = C + dense(those, (X[0], size)), unknowns(terms, size)
-        wanted = [multivariate_normal(np.zeros(6), each).logpdf(R) for each in (S, C)]
-        found = float(part.log_ratio(at, RESIDUAL, MEANS))
-        assert found == pytest.approx(wanted[0] - wanted[1], rel=1e-9, abs=1e-12)
-        left = part.information_left(jnp.asarray(information), at, MEANS)
-        np.testing.assert_allclose(whole(np.asarray(left)), np.linalg.inv(S), atol=1e-9)
+    S = C + dense(terms, size)
+    wanted = [multivariate_normal(np.zeros(6), each).logpdf(R) for each in (S, C)]
+    found = float(error.log_ratio(size, RESIDUAL, MEANS))
+    assert found == pytest.approx(wanted[0] - wanted[1], rel=1e-9, abs=1e-12)
+    left = error.information_left(jnp.asarray(information), size, MEANS)
+    np.testing.assert_allclose(whole(np.asarray(left)), np.linalg.inv(S), atol=1e-9)
 
 
 @pytest.mark.parametrize("terms", LISTS.values(), ids=LISTS)
 def test_terms_that_were_integrated_out_may_be_so_again(terms, information):
     once = marginalised(terms, information)
     again = marginalised(once.declarations, information)
-    found, wanted = (e.log_ratio(unknowns(terms), RESIDUAL, MEANS) for e in (again, once))
+    found, wanted = (e.log_ratio(SIZE, RESIDUAL, MEANS) for e in (again, once))
     assert float(found) == pytest.approx(float(wanted), rel=1e-9)
 
 
@@ -100,13 +82,10 @@ def test_what_is_kept_is_restored(terms, information):
     back = ModelError.restore(error.arrays(), error.words)
     assert back.fingerprint == error.fingerprint
     assert back.words == error.words
-    assert (back.of_mesh, back.is_learned) == (error.of_mesh, error.is_learned)
     assert back.priors.keys() == error.priors.keys()
-    for kept, part in ((back, error), (back.of_fem, error.of_fem)):
-        np.testing.assert_array_equal(
-            kept.log_ratio(unknowns(terms), RESIDUAL, MEANS),
-            part.log_ratio(unknowns(terms), RESIDUAL, MEANS),
-        )
+    np.testing.assert_array_equal(
+        back.log_ratio(SIZE, RESIDUAL, MEANS), error.log_ratio(SIZE, RESIDUAL, MEANS)
+    )
     arrays = error.arrays()
     for name in ("weights", "modes"):
         with pytest.raises(TypeError, match="missing"):
@@ -118,7 +97,6 @@ def test_what_is_kept_is_restored(terms, information):
 def test_arrays_have_the_names_that_saved_errors_have():
     """Files of earlier versions are read by these names."""
     diagonal, varying = ["weights", "strength", "modes"], ["modes", "shares", "sized"]
-    of_size = ["x", "log_sizes", "width", "centre", "scale"]
     W = np.ones(6)
 
     def names(*terms):
@@ -129,8 +107,6 @@ def test_arrays_have_the_names_that_saved_errors_have():
     of_varying = [f"varying_{n}" for n in (*varying, "information")]
     assert names(KNOWN, CURVE) == [*diagonal, "mixing", *of_varying, "size_scale"]
     assert names(GAIN) == [*diagonal, "mixing", *of_varying]
-    assert names(OF_MAP) == [*diagonal, *of_size]
-    assert names(OF_MESH) == [*diagonal, *of_size, "of_mesh"]
     # Rows of an inferred size may be between others.
     arrays = marginalised([GAIN, CURVE], W).arrays() | {
         "varying_sized": np.array([0.0, 1, 1, 0, 1])
@@ -143,49 +119,45 @@ def test_arrays_have_the_names_that_saved_errors_have():
     assert back.fingerprint == ModelError.restore(back.arrays(), words).fingerprint
 
 
-@pytest.mark.parametrize("name", ["known and sized", "all of a measurement", "shares and map"])
+@pytest.mark.parametrize("name", ["known and sized", "all of a measurement", "sized shares"])
 def test_it_is_differentiable_and_batched(name, information):
     terms = LISTS[name]
     error = marginalised(terms, information)
-    xs = unknowns(terms) + jnp.linspace(-0.2, 0.2, 5)[:, None]
+    sizes = SIZE + jnp.linspace(-0.2, 0.2, 5)
 
     def ratio(x):
         return error.log_ratio(x, RESIDUAL, MEANS)
 
-    slopes = jax.jit(jax.vmap(jax.grad(ratio)))(xs)
-    for x, slope in zip(xs, slopes, strict=True):
-        steps = 1e-5 * jnp.eye(len(x))
-        by_differences = [(ratio(x + step) - ratio(x - step)) / 2e-5 for step in steps]
+    slopes = jax.jit(jax.vmap(jax.grad(ratio)))(sizes)
+    for x, slope in zip(sizes, slopes, strict=True):
+        by_differences = (ratio(x + 1e-5) - ratio(x - 1e-5)) / 2e-5
         np.testing.assert_allclose(slope, by_differences, rtol=1e-5, atol=1e-8)
 
 
-@pytest.mark.parametrize("name", ["known and sized", "all of a measurement", "known and map"])
+@pytest.mark.parametrize("name", ["known and sized", "all of a measurement", "known and shares"])
 def test_replicates_and_the_largest_errors_have_the_covariance(name):
     terms = LISTS[name]
     error = marginalised(terms, np.ones(6))
     keys = jax.random.split(jax.random.key(0), 40_000)
-    drawn = jax.vmap(lambda key: error.draw(key, unknowns(terms), MEANS))(keys)
+    drawn = jax.vmap(lambda key: error.draw(key, SIZE, MEANS))(keys)
     flat = np.concatenate([np.reshape(drawn[n] - MEANS[n], (len(keys), -1)) for n in MEANS], axis=1)
-    S = dense(terms, X)
+    S = dense(terms, SIZE)
     np.testing.assert_allclose(np.cov(flat.T), S, atol=0.02 * np.abs(S).max())
     largest = error.largest(MEANS)
-    if error.is_learned:  # as large as it was in any run
-        size = np.exp(SIZE.log_sizes.max())
-        wanted = KNOWN.modes.T @ KNOWN.modes + size**2 * OF_MAP.modes.T @ OF_MAP.modes
-    else:
-        wanted = dense(terms, (X[0], 1.5))  # three scales of its prior
+    wanted = dense(terms, 1.5)  # three scales of its prior
     np.testing.assert_allclose(largest.T @ largest, wanted, atol=1e-9 * np.abs(wanted).max())
 
 
 def test_no_errors_change_nothing(information):
     none = ModelError()
-    assert float(none.log_ratio(jnp.zeros(1), RESIDUAL, MEANS)) == 0.0
-    assert none.information_left(information, jnp.zeros(1), MEANS) is information
-    drawn = none.draw(jax.random.key(0), jnp.zeros(1), MEANS)
+    assert float(none.log_ratio(1.0, RESIDUAL, MEANS)) == 0.0
+    assert none.information_left(information, 1.0, MEANS) is information
+    drawn = none.draw(jax.random.key(0), 1.0, MEANS)
     for name, mean in MEANS.items():
         np.testing.assert_array_equal(drawn[name], mean)
     assert none.largest(MEANS).shape == (0, 6)
-    assert not any((none.priors, none.names, none.is_learned, none.of_mesh))
+    assert not none.priors
+    assert not none.names
 
 
 @pytest.mark.parametrize(
@@ -193,7 +165,6 @@ def test_no_errors_change_nothing(information):
     [
         ([KNOWN, SIZED], "the size 'size' is inferred"),
         ([GAIN], "some are shares of what is predicted"),
-        ([KNOWN, OF_MAP], "the size of the forward map's error is learned"),
     ],
 )
 def test_unknowns_of_errors_that_vary_are_not_told(terms, reason):
@@ -214,10 +185,10 @@ HEAVY, INFERRED = cal.StudentTNoise(4.0, scale=0.1), cal.GaussianNoise(sd_scale=
         (cal.GaussianNoise(sd=0.1), (SIZED.unknown_size,), {}, None),
         (
             cal.GaussianNoise(sd=0.1),
-            (SIZED.unknown_size, LEARNED),
+            (SIZED.unknown_size, replace(SIZED, size=inferred_size("b", 2.0)).unknown_size),
             {},
-            "e: the size 'size' is inferred .scale 0.5. and the size of the forward map's error is "
-            "learned; only one size can be unknown, by one name and scale",
+            "e: the size 'b' is inferred .scale 2. and the size 'size' is inferred .scale 0.5.; "
+            "only one size can be unknown, by one name and scale",
         ),
     ],
 )

@@ -76,7 +76,7 @@ def test_the_likelihood_is_that_of_the_dense_covariance(model, errors):
     expected = multivariate_normal(np.zeros(len(C)), C).logpdf(residual)
     assert float(whole.map_log_likelihood(DRAW, data)) == pytest.approx(expected, rel=1e-10)
     # FEM's data has them, too.
-    by_fem = whole.fem_log_likelihood(DRAW, means, data)
+    by_fem = whole.log_likelihood(DRAW, means, data)
     assert float(by_fem) == pytest.approx(expected, rel=1e-10)
 
 
@@ -96,7 +96,7 @@ def test_replicates_have_its_covariance(model, errors):
     whole = cal.with_systematic(model, *errors)
     means, _ = model.predict(DRAW)
     keys = jax.random.split(jax.random.key(0), 20_000)
-    drawn = jax.vmap(lambda key: whole.fem_means(key, DRAW, means))(keys)
+    drawn = jax.vmap(lambda key: whole.means_with_errors(key, DRAW, means))(keys)
     flat = np.concatenate(
         [np.reshape(drawn[n] - means[n], (len(keys), -1)) for n in model.observe.parts], axis=1
     )
@@ -109,7 +109,7 @@ def test_information_left_is_the_inverse_of_the_dense_covariance(model, errors):
     means, _ = model.predict(DRAW)
     C, _ = dense(model, errors)
     information = information_about_means(model.noise, means)
-    left = whole.error.information_left(information, jnp.ones(2), means)
+    left = whole.error.information_left(information, 1.0, means)
     np.testing.assert_allclose(left, np.linalg.inv(C), atol=1e-8)
 
 

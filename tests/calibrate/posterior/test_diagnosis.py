@@ -73,13 +73,14 @@ def test_a_wrong_map_comes_first_and_chains_on_it_are_not_blamed_on_the_sampler(
     errors = {MAP_ERRORS: json.dumps({"reaction:top:x@a": 0.2, "reaction:top:x@b": 3.6})}
     first, chains, few = said(row={"r_hat": 1.5, "ess_bulk": 7.0}, attributes=errors)
     assert first.startswith("the forward map misses FEM by 3.6 noise sd in reaction:top:x@b")
-    assert "--forward corrected" in first
-    assert "--error-runs N" in first
+    assert "infer with --forward rounds (FEM where the posterior is) or corrected" in first
     assert chains == "the chains disagree about mu, R-hat 1.500: mend the map first"
     assert "more draws" not in few
-    # A specimen's maps are exact, so there is nothing to correct but the law's finite kappa.
-    for kind, remedy in (("incompressible", "infer with --forward homogeneous, or let the map's"),
-                         ("homogeneous", "at the draws: let the map's error widen")):  # fmt: skip
+    # A specimen's maps are exact, so there is nothing to correct but the law's finite kappa; rounds
+    # have no other map to begin from.
+    for kind, remedy in (("incompressible", "infer with --forward homogeneous"),
+                         ("homogeneous", "at the draws: check the options of FEM"),
+                         ("rounds", "infer with more runs (--most-runs N)")):  # fmt: skip
         (sentence,) = said(attributes=errors | {"forward": kind})
         assert remedy in sentence
         assert "corrected" not in sentence

@@ -124,6 +124,21 @@ def test_a_moved_scene_is_not_an_edited_run(folder):
     assert read_posterior(folder)[0].root == "/elsewhere"
 
 
+def test_a_run_of_an_earlier_version_is_read_unless_it_learned_an_error(folder, capsys):
+    tree = read_tree(folder / "posterior.nc")
+    entries = {"error_runs": 0, "mesh_error_runs": 0}
+    tree.attrs["run"] = json.dumps(json.loads(tree.attrs["run"]) | entries)
+    tree.to_netcdf(folder / "posterior.nc", engine="h5netcdf")
+    edit(folder, **entries)
+    assert read_posterior(folder)[0].seed == RUN.seed
+    for name in entries:
+        edit(folder, **entries | {name: 24})
+        said = refusal(folder, capsys)
+        assert f"run.json: {name} is 24, but errors are no longer learned; infer again" in said
+        assert "--forward rounds" in said
+        assert "finer:SCENE" in said
+
+
 def test_a_posterior_that_names_no_run_is_refused(infer_once, folder):
     tree = read_tree(folder / "posterior.nc")
     del tree.attrs["run"]

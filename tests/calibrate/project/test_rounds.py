@@ -1,10 +1,12 @@
 """Rounds of FEM runs find a posterior that nobody's range contains, and teach an emulator there."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+import calibrate as cal
 import emulator as em
 from calibrate.cli import main
 from calibrate.priors import Population
@@ -122,15 +124,20 @@ def test_fem_that_fails_in_a_third_of_the_prior_costs_runs_and_nothing_else(monk
 
 
 def test_only_a_scene_without_an_emulator_gets_rounds():
-    problem = read_problem(Run(BEAM, truth={"mu": 70.0, "lam": 70.0}, observe="nodes:9"))
+    run = Run(BEAM, truth={"mu": 70.0, "lam": 70.0}, observe="nodes:9")
+    problem = read_problem(run)
     assert by_rounds(problem) is problem
+    for change in ("finer", "wider"):  # they have the name of a scene that has one
+        assert (
+            by_rounds(read_problem(replace(run, scene=f"{change}:{BEAM}"))).run.forward == "rounds"
+        )
     with pytest.raises(InputError, match="calibrate infer makes it"):
         model_before_data(RUN)
 
 
 def test_a_wide_prior_has_the_range_as_one_sd_and_keeps_what_is_stated():
     scene = em.scenes.once_clamped_beam(cells=(4, 1, 1), order=1)
-    wide = wide_prior(scene, bounded=["lam"])
+    wide = wide_prior(scene, without=["lam"])
     assert wide.median == pytest.approx({"mu": np.sqrt(5000.0)})
     assert wide.log_sd["mu"] == pytest.approx(np.log(2.0))  # 50 to 100 kPa is half of that
     stated = Population({"mu": 20.0}, {"mu": 0.3})
@@ -149,6 +156,17 @@ def test_a_range_stays_off_what_nature_does_not_allow():
     space = {p.name: p for p in widened(scene, wide_prior(scene)).parameters}
     assert 0.0 < space["nu"].low < space["nu"].high < 0.5
     assert space["nu"].scale == "log"
+
+
+def test_what_is_known_has_no_wide_prior():
+    run = replace(RUN, truth={"mu": 190.0}, known={"lam": 400.0})  # four times the range's end
+    problem = read_problem(run)
+    assert set(problem.run.prior["median"]) == {"mu"}
+    assert problem.scene.parameters[1].high > 400.0
+    assert read_problem(problem.run).run.prior == problem.run.prior
+    stated = replace(run, prior={"median": {"lam": 60.0}, "log_sd": {"lam": 0.5}})
+    with pytest.raises(InputError, match="'lam' is known and has a prior"):
+        read_problem(stated)
 
 
 def test_a_prior_in_which_fem_fails_is_named(monkeypatch):
@@ -184,3 +202,48 @@ def test_one_command_from_a_scene_file_and_data_to_a_verdict(tmp_path, capsys):
     mu = result["parameters"]["mu"]
     assert abs(mu["mean"] - 300.0) < 3.0 * mu["sd"] < 90.0
     assert mu["of_prior"] < 0.2
+
+
+SHORT = OWN.replace("order = 2\n", "")
+TIP = np.array([[35.0, 5.0, 5.0], [24.0, 5.0, 5.0]])
+
+
+def test_data_that_refuse_a_coarse_mesh_are_accepted_on_the_finer_one(tmp_path, capsys):
+    """Linear elements lock; the remedy that the verdict names is one word more."""
+    em.write_mesh(tmp_path / "own.vtu", em.generators.box((40.0, 10.0, 10.0), (4, 1, 2)))
+    (tmp_path / "own.toml").write_text(SHORT)
+    finer = em.find_scene(f"finer:{tmp_path / 'own.toml'}")
+    observe = cal.landmarks(finer, TIP)
+    truth = finer.theta(mu=75.0, lam=70.0)
+    u = em.Simulator(finer)(truth)[observe.nodes]
+    tip = np.asarray(observe(u, truth)) + 0.2 * np.random.default_rng(0).normal(size=(2, 3))
+    rows = [",".join(f"{value:.6f}" for value in row) for row in np.hstack([TIP, tip])]
+    (tmp_path / "tip.csv").write_text("\n".join(["x,y,z,ux,uy,uz", *rows]))
+    words = ["--data", str(tmp_path / "tip.csv"), "--noise", "0.2", "--known", "lam=70"]
+
+    def told(scene):
+        folder = tmp_path / ("fine" if scene.startswith("finer:") else "coarse")
+        main(["infer", scene, *words, "--draws", "500", "--out", str(folder), "--json"])
+        return json.loads(capsys.readouterr().out)
+
+    coarse = told(str(tmp_path / "own.toml"))
+    assert coarse["verdict"] == "not certified"
+    (said,) = [f for f in coarse["certificate"]["findings"] if "on a finer mesh" in f]
+    assert "infer on the finer mesh (calibrate infer finer:SCENE)" in said
+    fine = told(f"finer:{tmp_path / 'own.toml'}")
+    assert fine["verdict"] == "accepted"
+    assert fine["forward"] == coarse["forward"] == "rounds"
+    mu, locked = (result["parameters"]["mu"] for result in (fine, coarse))
+    assert abs(mu["mean"] - 75.0) < 3.0 * mu["sd"] < 45.0
+    assert abs(locked["mean"] - 75.0) > 3.0 * locked["sd"]
+
+
+def test_the_finer_mesh_of_a_built_in_body_is_inferred_on_and_read_again(tmp_path):
+    run = replace(RUN, scene=f"finer:{BEAM}", forward="emulator", forward_options={})
+    posterior = infer(run, tmp_path / "r", check_map=False)
+    again, read = read_posterior(tmp_path / "r")
+    assert again.forward == "rounds"
+    assert read.model.forward.scene.mesh.order == 2
+    for name, value in TRUTH.items():
+        row = posterior.summary()[name]
+        assert abs(row["mean"] - value) < 3.0 * row["sd"], name

@@ -17,7 +17,6 @@ from emulator.core.gaussian_process import (
     covariance,
     fit_lengths,
     fold,
-    kernel_mean,
     negative_log_likelihood,
 )
 
@@ -113,18 +112,6 @@ def test_regression_against_dense_matrices(library):
     assert isinstance(regression.factor, np.ndarray) == (library is np)
     np.testing.assert_allclose(regression.weights(library.asarray(y)), np.linalg.solve(K, y))
     np.testing.assert_allclose(regression.inverse(), np.linalg.inv(K))
-
-
-def test_kernel_means_are_between_the_values():
-    """By the sums; at points so far away that all correlations underflow, the nearest value."""
-    rng = np.random.default_rng(5)
-    squared, values = rng.random((4, 6)) * 9.0, rng.normal(size=6)
-    w = np.exp(-0.5 * squared)
-    expected = (w * values).sum(axis=1) / w.sum(axis=1)
-    np.testing.assert_allclose(kernel_mean(squared, values), expected)
-    np.testing.assert_allclose(kernel_mean(jnp.asarray(squared), jnp.asarray(values)), expected)
-    far = 1e6 + 1e4 * np.arange(6.0)
-    assert kernel_mean(far, values) == pytest.approx(values[0])
 
 
 @jax.jit
