@@ -14,7 +14,14 @@ from calibrate.certificate.reweighting import can_reweight, reweighted
 from calibrate.measurements import missing_values
 from calibrate.posterior import Posterior, sample
 from calibrate.posterior.diagnosis import MAP_ERRORS, MAP_MOVES, ROUNDS_RECORD, SCALED_NOISE
-from calibrate.project.problem import Problem, build_model, read_problem, simulator_of, with_data
+from calibrate.project.problem import (
+    Problem,
+    build_model,
+    read_problem,
+    simulator_of,
+    stated_priors,
+    with_data,
+)
 from calibrate.project.results import (
     CERTIFICATE,
     SAMPLING,
@@ -159,6 +166,7 @@ def report(run: Run, posterior: Posterior, certificate: Certificate | None) -> d
         "scene": run.scene,
         "forward": run.forward,
         "parameters": table,
+        "priors": stated_priors(run, posterior.model),
         "divergences": posterior.divergences,
         "verdict": NOT_CERTIFIED,
         "k_hat": None,

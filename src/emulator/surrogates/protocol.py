@@ -169,6 +169,7 @@ class ForwardKind:
         raises ``KeyError`` where one is missing. ``None`` for a kind that is not fitted.
     words : the further words that have an effect: ``emulator`` where one is an ingredient.
     closer : words on the map to take where this one is too far from FEM; none for an exact one.
+    anywhere : whether its maps answer outside of their scene's box, too.
     """
 
     name: str
@@ -179,3 +180,4 @@ class ForwardKind:
     from_arrays: Callable[[Any, Arrays], ForwardMap] | None = None
     words: tuple[str, ...] = ()
     closer: str = "--forward corrected (or more of its --steps)"
+    anywhere: bool = False
