@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from calibrate.priors.population import BOX, Population, population_called
+from calibrate.priors.population import Population
 from emulator.scenes.finer import wider_within
 from emulator.scenes.forward_problem import ForwardProblem
 from emulator.scenes.parameter_space import LogNormal
@@ -41,49 +41,20 @@ def wide_prior(scene: ForwardProblem, bounded: Collection[str] = ()) -> Populati
 
 
 def _population(priors: Mapping[str, LogNormal]) -> Population | None:
-    return Population(**_columns({n: asdict(p) for n, p in priors.items()})) if priors else None
+    return Population(**columns({n: asdict(p) for n, p in priors.items()})) if priors else None
 
 
-def _columns(by_parameter: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+def columns(by_parameter: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
     """Return fields of a population, the inverse of :attr:`Population.by_parameter`."""
     keys = ("median", "log_sd", "source")
     return {key: {name: entry[key] for name, entry in by_parameter.items()} for key in keys}
-
-
-def as_wide(
-    prior: str | Mapping[str, Any], scene: ForwardProblem, wide: Population | None
-) -> tuple[str | dict[str, Any], ForwardProblem]:
-    """Return a run's prior in numbers, wide where it states none, and the scene as wide as it.
-
-    Parameters
-    ----------
-    prior : the run's words or numbers. wide : the prior of the parameters that it does not state.
-    """
-    population = completed(population_called(prior), wide)
-    if population is None:
-        return BOX, scene
-    return asdict(population), widened(scene, population)
-
-
-def less(
-    prior: str | Mapping[str, Any], words: str | Mapping[str, Any], known: Collection[str]
-) -> str | dict[str, Any]:
-    """Return a run's ``prior`` without known parameters, unless its ``words`` named them."""
-    stated, population = population_called(words), population_called(prior)
-    if population is None:
-        return BOX
-    inferred = [n for n in population.median if n not in known or (stated and n in stated.median)]
-    if not inferred:
-        return BOX
-    by_parameter = {name: population.by_parameter[name] for name in inferred}
-    return asdict(replace(population, **_columns(by_parameter)))
 
 
 def completed(stated: Population | None, wide: Population | None) -> Population | None:
     """Return the population of ``stated`` parameters, and of all others that ``wide`` has."""
     if stated is None or wide is None:
         return stated or wide
-    return replace(stated, **_columns(wide.by_parameter | stated.by_parameter))
+    return replace(stated, **columns(wide.by_parameter | stated.by_parameter))
 
 
 def widened[P: ForwardProblem](scene: P, prior: Population) -> P:

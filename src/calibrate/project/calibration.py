@@ -19,7 +19,6 @@ from calibrate.project.problem import (
     build_model,
     read_problem,
     simulator_of,
-    stated_priors,
     with_data,
 )
 from calibrate.project.results import (
@@ -33,6 +32,7 @@ from calibrate.project.results import (
 )
 from calibrate.project.rounds import account_of, by_rounds, taught_map
 from calibrate.project.run import Run
+from calibrate.project.stated_priors import stated_priors
 from calibrate.provenance import as_attributes
 from calibrate.state_names import split
 from calibrate.statistical_model.errors import NOT_ASKED, map_errors

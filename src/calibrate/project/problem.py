@@ -21,9 +21,8 @@ from calibrate.measurements import Observations, parse_observation
 from calibrate.measurements.data import read_measurements
 from calibrate.measurements.usual_noise import size_in, usual_noise
 from calibrate.priors import prior_of
-from calibrate.priors.population import population_called
-from calibrate.priors.wide import as_wide, less, stated_prior, wide_prior
 from calibrate.project.run import Run
+from calibrate.project.stated_priors import check_bounded, without_box, without_known
 from calibrate.state_names import split
 from calibrate.statistical_model import Model, with_error
 from calibrate.statistical_model.errors import with_described_errors
@@ -36,11 +35,10 @@ from emulator.core.rooms import offered
 from emulator.fem import NewtonOptions, Simulator
 from emulator.fem.solution import EquilibriumSolver
 from emulator.scenes.forward_problem import ForwardProblem
-from emulator.scenes.scene import Scene, with_mesh
+from emulator.scenes.scene import Scene
 from emulator.surrogates import registry
 from emulator.surrogates.fem import by_solver
 from emulator.surrogates.protocol import ForwardMap, Ingredients
-from emulator.surrogates.taught import ROUNDS
 
 
 @kept
@@ -57,17 +55,6 @@ def simulator_of(scene: ForwardProblem, load_steps: int = 1) -> EquilibriumSolve
         return Simulator(scene, NewtonOptions.load_steps(load_steps))
     (homogeneous,) = offered("emulator.specimens.homogeneous", "homogeneous")
     return homogeneous(scene)
-
-
-def _check_bounded(run: Run, scene: ForwardProblem) -> None:
-    """Refuse a bounded parameter whose range follows from the prior that the scene states."""
-    stated = {parameter.name for parameter in scene.parameters if parameter.prior is not None}
-    for name in run.bounded:
-        if split(name)[0] in stated:
-            raise InputError(
-                f"bounded: scene '{scene.name}' has a prior of '{name}', and no range that nature "
-                "could end"
-            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,40 +138,16 @@ def read_problem(
                         "it; say it once"
                     )
             run = replace(run, known={**in_files, **run.known})
-        if run.prior is not words:
-            run = replace(run, prior=less(run.prior, words, run.known))
+        run = without_known(run, words)
         run = run.named(observe, scene)
         run.noises(observe)
-        _check_bounded(run, scene)
+        check_bounded(run, scene)
         prior = prior_of(run.prior, scene)
         boxed(load_states(scene, observe.states, prior, run.known)[0], prior, run.bounded)
         for name, description in run.systematic.items():
             words = dict.fromkeys(str(description["of"]).split("+"))
             observe.expand(words, f"systematic '{name}': of")
         return Problem(run, scene, observe, data)
-
-
-def without_box(run: Run, scene: ForwardProblem) -> tuple[Run, ForwardProblem]:
-    """Return the run with its prior in numbers, and the scene as wide, where no map needs a box.
-
-    Rounds of FEM runs go where the posterior is. A map that answers anywhere needs no range of a
-    parameter whose prior the scene states, unless something of the scene was learned in ranges.
-    """
-    anywhere = registry.forward_kind(run.forward).anywhere and not scene.learned_in_box
-    if run.forward == ROUNDS.name:
-        wide = wide_prior(with_mesh(scene), run.bounded)
-    elif not anywhere or (wide := stated_prior(scene)) is None:
-        return run, scene
-    prior, scene = as_wide(run.prior, scene, wide)
-    return replace(run, prior=prior), scene
-
-
-def stated_priors(run: Run, model: Model) -> dict[str, dict[str, Any]]:
-    """Return median, log_sd and source of the priors of unknowns that a run or its scene states."""
-    population = population_called(run.prior) or stated_prior(model.forward.scene)
-    inferred = {split(name)[0] for name in model.states.unknowns}
-    by_parameter = {} if population is None else population.by_parameter
-    return {name: entry for name, entry in by_parameter.items() if name in inferred}
 
 
 @contextmanager

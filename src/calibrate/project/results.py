@@ -33,8 +33,9 @@ from calibrate.measurements import leave_out_missing, observations_from_json
 from calibrate.measurements.data import write_data
 from calibrate.model_error import ModelError
 from calibrate.posterior import Posterior, read_tree
-from calibrate.project.problem import Problem, ingredients, model_of, without_box
+from calibrate.project.problem import Problem, ingredients, model_of
 from calibrate.project.run import Run
+from calibrate.project.stated_priors import without_box
 from emulator.catalogue import find_problem
 from emulator.core import schema
 from emulator.core.errors import InputError

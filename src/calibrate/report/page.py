@@ -22,8 +22,8 @@ from calibrate.priors.population import in_words as priors_in_words
 from calibrate.priors.priors import Truncated
 from calibrate.project import Run, holds_population, read_posterior, simulator_of
 from calibrate.project.members import read_members
-from calibrate.project.problem import stated_priors
 from calibrate.project.results import CERTIFICATE, REPORT
+from calibrate.project.stated_priors import stated_priors
 from calibrate.report import charts, parts, population
 from calibrate.report.body import body_figure
 from calibrate.report.parts import Verdict

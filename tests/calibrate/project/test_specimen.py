@@ -16,8 +16,9 @@ from calibrate.cli import main
 from calibrate.measurements.data import read_measurements
 from calibrate.project import model_before_data, read_posterior
 from calibrate.project.experiment import read_experiment
-from calibrate.project.problem import simulator_of, without_box
+from calibrate.project.problem import simulator_of
 from calibrate.project.specimen import draft_specimen
+from calibrate.project.stated_priors import without_box
 from emulator.core.errors import InputError
 from emulator.scenes.file import read_scene
 from emulator.specimens.grips import Grips, GripStresses
