@@ -88,8 +88,8 @@ print(Path("patient.toml").read_text())
 # %% [markdown]
 # `order = 2` puts a node on every edge: the file's linear tetrahedra lock, as section 5 shows.
 #
-# The file is yours to edit. Lines marked `CHANGE` cannot come from a mesh: the ranges of the parameters are your prior, and
-# `axis` is the direction from apex to base. A misspelt key or set is refused in one line that names what is there:
+# The file is yours to edit. The priors of the parameters are published values, with their source; lines marked `CHANGE` were
+# guessed; `axis` is the direction from apex to base. A misspelt key or set is refused in one line that names what is there:
 
 # %%
 text = Path("patient.toml").read_text()

@@ -51,6 +51,7 @@ def _cell(value: object) -> str:
 def posterior_summary(report: Mapping[str, Any]) -> str:
     """Return the parameter table and the verdict as text."""
     from calibrate.certificate.verdict import shifts
+    from calibrate.priors.population import in_words
 
     parameters = report["parameters"]
     columns = ["mean", "sd", "low", "high", "r_hat", "ess_bulk"]
@@ -75,6 +76,7 @@ def posterior_summary(report: Mapping[str, Any]) -> str:
         finer = "FEM between the grips" if "grips" in shifts_by_judge else "a finer mesh"
         judges = ", ".join(shifts_by_judge)
         lines.append(f"{judges}: how far FEM, and {finer}, would move each mean, in sd")
+    lines += in_words(report.get("priors", {}))
     lines.append(
         f"{report['chains']} chains x {report['draws']} draws, {report['divergences']} divergences"
         f", forward map: {report['forward']}"

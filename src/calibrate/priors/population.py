@@ -38,7 +38,7 @@ class Population:
     median : median by parameter, in its unit.
     log_sd : sd of the logarithm by parameter, about its relative sd.
     correlation : of the logarithms, by two names joined by a comma; 0 where none is given.
-    source : where the numbers are from.
+    source : where the numbers are from, of all parameters or by parameter.
 
     Raises
     ------
@@ -49,7 +49,7 @@ class Population:
     median: dict[str, float]
     log_sd: dict[str, float]
     correlation: dict[str, float] = field(default_factory=dict)
-    source: str = ""
+    source: str | dict[str, str] = ""
 
     def __post_init__(self) -> None:
         if not self.median or set(self.median) != set(self.log_sd):
@@ -75,6 +75,21 @@ class Population:
             i, j = map(names.index, ends)
             matrix[i, j] = matrix[j, i] = value
         return Dependence(names, matrix)
+
+    @property
+    def by_parameter(self) -> dict[str, dict[str, Any]]:
+        """Median, log_sd and source of each parameter, by its name."""
+        sources = self.source
+        if isinstance(sources, str):
+            sources = dict.fromkeys(self.median, sources)
+        return {
+            name: {
+                "median": median,
+                "log_sd": self.log_sd[name],
+                "source": sources.get(name, ""),
+            }
+            for name, median in self.median.items()
+        }
 
     def prior(self, scene: ForwardProblem) -> Prior:
         """Return the population as the prior of ``scene``, cut to its range.
@@ -121,6 +136,15 @@ def population_of_fits(fits: Mapping[str, Sequence[float]], source: str = "") ->
         correlation={f"{names[j]},{names[i]}": float(matrix[i, j]) for i, j in pairs},
         source=source,
     )
+
+
+def in_words(priors: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return a line for each source of the priors of :attr:`Population.by_parameter`."""
+    by_source = dict[str, list[str]]()
+    for name, entry in priors.items():
+        numbers = f"{name} {entry['median']:.4g} (log sd {entry['log_sd']:.2g})"
+        by_source.setdefault(entry["source"] or "no source given", []).append(numbers)
+    return [f"prior median of {', '.join(words)}: {source}" for source, words in by_source.items()]
 
 
 VENTRICLES = Population(

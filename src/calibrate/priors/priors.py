@@ -32,6 +32,7 @@ from numpyro.distributions import constraints
 from calibrate.state_names import split
 from emulator.core.errors import InputError
 from emulator.scenes.forward_problem import ForwardProblem
+from emulator.scenes.parameter_space import Parameter
 
 Prior = Mapping[str, dist.Distribution]
 
@@ -41,11 +42,18 @@ _EDGE = 1e-15  # mass beyond which scores end, at 7.9 sd: the ends of a range ha
 
 
 def box_prior(scene: ForwardProblem) -> dict[str, dist.Distribution]:
-    """Return uniform priors over the parameters' ranges, log-uniform where the scale is ``log``."""
-    return {
-        p.name: dist.LogUniform(p.low, p.high) if p.scale == "log" else dist.Uniform(p.low, p.high)
-        for p in scene.parameters
-    }
+    """Return the priors that a scene's parameters have over their ranges.
+
+    Uniform ones, log-uniform where the scale is ``log``, and the log-normals that the scene states.
+    """
+    return {p.name: _over_range(p) for p in scene.parameters}
+
+
+def _over_range(parameter: Parameter) -> dist.Distribution:
+    low, high = parameter.low, parameter.high
+    if (prior := parameter.prior) is not None:
+        return log_normal(prior.median, prior.log_sd, low, high)
+    return dist.LogUniform(low, high) if parameter.scale == "log" else dist.Uniform(low, high)
 
 
 def truncated_normal(

@@ -1,74 +1,63 @@
-"""Wide priors, from the ranges that somebody thought possible, and scenes as wide as they are."""
+"""Wide priors, those that scenes state or from ranges, and scenes as wide as they are."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from calibrate.priors.population import BOX, Population, population_called
+from calibrate.priors.population import Population
 from emulator.scenes.finer import wider_within
 from emulator.scenes.forward_problem import ForwardProblem
-from emulator.scenes.scene import Scene, with_mesh
+from emulator.scenes.parameter_space import LogNormal
 
 _LEAST_LOG_SD = float(np.log(2.0))
+_OF_RANGE = "the scene's range, one sd of the logarithm to each side"
 _WIDTH = 3.72  # sd to each side of a median that hold all but 2e-4 of the mass
 
 
-def wide_prior(scene: ForwardProblem, without: Collection[str] = ()) -> Population | None:
+def stated_prior(scene: ForwardProblem) -> Population | None:
+    """Return the log-normals that a scene states; None where it states none."""
+    return _population({p.name: p.prior for p in scene.parameters if p.prior is not None})
+
+
+def wide_prior(scene: ForwardProblem, bounded: Collection[str] = ()) -> Population | None:
     """Return log-normals of the parameters above zero; None where there is none.
 
-    A range that somebody thought possible is one sd of the logarithm to each side of its middle,
-    and a factor of 2 at least.
-
-    without : the parameters that get none, as their range is nature's or their value is known.
+    They are what the scene states. A range that somebody thought possible is one sd of the
+    logarithm to each side of its middle, and a factor of 2 at least. A parameter whose range is
+    ``bounded`` by nature keeps it.
     """
-    median, log_sd = dict[str, float](), dict[str, float]()
+    priors = dict[str, LogNormal]()
     for k, parameter in enumerate(scene.parameters):
-        if parameter.low > 0.0 and parameter.name not in without:
-            median[parameter.name] = float(scene.centre[k])
-            half = 0.5 * float(np.log(parameter.high / parameter.low))
-            log_sd[parameter.name] = max(half, _LEAST_LOG_SD)
-    if not median:
-        return None
-    source = "the scene's ranges, one sd of the logarithm to each side"
-    return Population(median, log_sd, source=source)
+        if parameter.prior is not None:
+            priors[parameter.name] = parameter.prior
+        elif parameter.low > 0.0 and parameter.name not in bounded:
+            half = max(0.5 * float(np.log(parameter.high / parameter.low)), _LEAST_LOG_SD)
+            priors[parameter.name] = LogNormal(float(scene.centre[k]), half, _OF_RANGE)
+    return _population(priors)
 
 
-Words = str | Mapping[str, Any]
-"""A run's prior, in words or numbers."""
+def _population(priors: Mapping[str, LogNormal]) -> Population | None:
+    return Population(**columns({n: asdict(p) for n, p in priors.items()})) if priors else None
 
 
-def as_wide(prior: Words, scene: ForwardProblem, bounded: Collection[str]) -> ForwardProblem:
-    """Return the scene as wide as :func:`in_numbers` of all of its parameters.
-
-    bounded : the parameters whose range nature ends.
-    """
-    population = completed(population_called(prior), wide_prior(scene, bounded))
-    return scene if population is None else widened(with_mesh(scene), population)
-
-
-def in_numbers(
-    prior: Words, scene: ForwardProblem, without: Collection[str]
-) -> str | dict[str, Any]:
-    """Return a run's prior in numbers, wide where it states none, of a ``scene`` not yet widened.
-
-    without : the parameters that have none, unless it is stated.
-    """
-    population = completed(population_called(prior), wide_prior(scene, without))
-    return BOX if population is None else asdict(population)
+def columns(by_parameter: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return fields of a population, the inverse of :attr:`Population.by_parameter`."""
+    keys = ("median", "log_sd", "source")
+    return {key: {name: entry[key] for name, entry in by_parameter.items()} for key in keys}
 
 
 def completed(stated: Population | None, wide: Population | None) -> Population | None:
     """Return the population of ``stated`` parameters, and of all others that ``wide`` has."""
     if stated is None or wide is None:
         return stated or wide
-    return replace(stated, median=wide.median | stated.median, log_sd=wide.log_sd | stated.log_sd)
+    return replace(stated, **columns(wide.by_parameter | stated.by_parameter))
 
 
-def widened(scene: Scene, prior: Population) -> Scene:
+def widened[P: ForwardProblem](scene: P, prior: Population) -> P:
     """Return ``scene`` with ranges that hold all but 2e-4 of a prior's mass of each parameter.
 
     A range ends just before a limit of nature, as 1/2 is of Poisson's ratio.
@@ -79,4 +68,4 @@ def widened(scene: Scene, prior: Population) -> Scene:
             step = float(np.exp(_WIDTH * prior.log_sd[parameter.name]))
             wide = replace(parameter, low=median / step, high=median * step, scale="log")
             parameters[k] = wider_within(parameter, scene.quantities[parameter.name], wide)
-    return replace(scene, parameters=tuple(parameters))
+    return cast(P, replace(cast(Any, scene), parameters=tuple(parameters)))

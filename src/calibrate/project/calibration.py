@@ -14,7 +14,13 @@ from calibrate.certificate.reweighting import can_reweight, reweighted
 from calibrate.measurements import missing_values
 from calibrate.posterior import Posterior, sample
 from calibrate.posterior.diagnosis import MAP_ERRORS, MAP_MOVES, ROUNDS_RECORD, SCALED_NOISE
-from calibrate.project.problem import Problem, build_model, read_problem, simulator_of, with_data
+from calibrate.project.problem import (
+    Problem,
+    build_model,
+    read_problem,
+    simulator_of,
+    with_data,
+)
 from calibrate.project.results import (
     CERTIFICATE,
     SAMPLING,
@@ -26,6 +32,7 @@ from calibrate.project.results import (
 )
 from calibrate.project.rounds import account_of, by_rounds, taught_map
 from calibrate.project.run import Run
+from calibrate.project.stated_priors import stated_priors
 from calibrate.provenance import as_attributes
 from calibrate.state_names import split
 from calibrate.statistical_model.errors import NOT_ASKED, map_errors
@@ -162,6 +169,7 @@ def report(run: Run, posterior: Posterior, certificate: Certificate | None) -> d
         "scene": run.scene,
         "forward": run.forward,
         "parameters": table,
+        "priors": stated_priors(run, posterior.model),
         "divergences": posterior.divergences,
         "verdict": NOT_CERTIFIED,
         "k_hat": None,

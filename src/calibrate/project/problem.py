@@ -21,8 +21,8 @@ from calibrate.measurements import Observations, parse_observation
 from calibrate.measurements.data import read_measurements
 from calibrate.measurements.usual_noise import size_in, usual_noise
 from calibrate.priors import prior_of
-from calibrate.priors.wide import as_wide, in_numbers
 from calibrate.project.run import Run
+from calibrate.project.stated_priors import check_bounded, without_box, without_known
 from calibrate.state_names import split
 from calibrate.statistical_model import Model
 from calibrate.statistical_model.errors import with_described_errors
@@ -39,7 +39,6 @@ from emulator.scenes.scene import Scene
 from emulator.surrogates import registry
 from emulator.surrogates.fem import by_solver
 from emulator.surrogates.protocol import ForwardMap, Ingredients
-from emulator.surrogates.taught import ROUNDS
 
 
 @kept
@@ -124,9 +123,8 @@ def read_problem(
         if scene is None:
             scene = find_problem(run.scene, run.root)
             table = scene.table
-        narrow, by_rounds = scene, run.forward == ROUNDS.name
-        if by_rounds:
-            scene = as_wide(run.prior, scene, run.bounded)
+        words = run.prior
+        run, scene = without_box(run, scene)
         if run.is_synthetic:
             names = {**run.known, **run.truth}
             states = tuple(dict.fromkeys(state for _, state in map(split, names) if state))
@@ -140,10 +138,10 @@ def read_problem(
                         "it; say it once"
                     )
             run = replace(run, known={**in_files, **run.known})
-        if by_rounds:
-            run = replace(run, prior=in_numbers(run.prior, narrow, {*run.bounded, *run.known}))
+        run = without_known(run, words)
         run = run.named(observe, scene)
         run.noises(observe)
+        check_bounded(run, scene)
         prior = prior_of(run.prior, scene)
         boxed(load_states(scene, observe.states, prior, run.known)[0], prior, run.bounded)
         for name, description in run.systematic.items():

@@ -33,9 +33,9 @@ from calibrate.measurements import leave_out_missing, observations_from_json
 from calibrate.measurements.data import write_data
 from calibrate.model_error import ModelError
 from calibrate.posterior import Posterior, read_tree
-from calibrate.priors.wide import as_wide
 from calibrate.project.problem import Problem, ingredients, model_of
 from calibrate.project.run import Run
+from calibrate.project.stated_priors import without_box
 from emulator.catalogue import find_problem
 from emulator.core import schema
 from emulator.core.errors import InputError
@@ -43,7 +43,6 @@ from emulator.core.line_index import Path as Place
 from emulator.core.line_index import json_lines
 from emulator.core.store import exclusive, read_arrays, read_json, save_arrays, write_json
 from emulator.surrogates import registry
-from emulator.surrogates.taught import ROUNDS
 
 RUN, DATA, POSTERIOR, CERTIFICATE = "run.json", "data.csv", "posterior.nc", "certificate.json"
 FORWARD, ERROR = "forward.safetensors", "error.safetensors"
@@ -151,8 +150,7 @@ def read_posterior(folder: str | Path) -> tuple[Run, Posterior]:
     entries, lines = read_json(folder / RUN), json_lines((folder / RUN).read_text("utf-8"))
     run = run_of(entries, str(folder / RUN), lines)
     scene = find_problem(run.scene, run.root)
-    if run.forward == ROUNDS.name:
-        scene = as_wide(run.prior, scene, run.bounded)
+    scene = without_box(run, scene)[1]
     tree = read_tree(path)
     if tree.attrs.get("scene_fingerprint") != scene.fingerprint:
         raise InputError(f"{path} was made for another scene than '{run.scene}'")

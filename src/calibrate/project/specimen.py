@@ -18,6 +18,7 @@ from emulator.core.errors import InputError
 from emulator.core.units import with_unit
 from emulator.mechanics.laws import Law, find_law
 from emulator.mechanics.laws.law import Quantity
+from emulator.scenes.draft import prior_lines
 from emulator.scenes.file import read_scene
 from emulator.scenes.parameter_space import Parameter
 from emulator.specimens.specimen import Specimen, read_states, require_specimen, specimen
@@ -26,6 +27,7 @@ from emulator.specimens.tube import Tube
 
 _MODULI = (0.005, 3.0)  # range of a modulus, as a share of the largest stress over its strain
 _EXPONENTS = (0.1, 50.0)
+_GUESSED = 2.0  # sd of the logarithm to each side of a guess that reach the ends of its range
 _KAPPA = 1e4  # bulk modulus, likewise: 1000 changes stresses of stretched fibres by 0.4 %
 _NOISE = 0.03  # scale of both sds of the noise, as a share of the largest stress
 _NO_GRIPS_PULLED = 'grips = "none"   # CHANGE: the verdict takes stresses to be even'
@@ -128,7 +130,7 @@ def _notes(
         ),
         *_drifts(list(cells.rows), part.states, measured),
         of_law,
-        f"ranges of moduli follow from a stiffness of {slope:.3g} kPa",
+        f"priors of moduli follow from a stiffness of {slope:.3g} kPa",
         *([] if tube else ['grips = "none": stresses are taken to be even']),
         "incompressible, --forward homogeneous takes the law's kappa; certificates take it, too",
         *(
@@ -262,21 +264,19 @@ def _scene_text(
 
 def _parameter(quantity: Quantity, slope: float) -> list[str]:
     low, high = (share * slope for share in _MODULI) if quantity.unit == "kPa" else _EXPONENTS
-    logarithmic = not quantity.low_admitted
+    head = [f"[parameters.{quantity.name}]", f'unit = "{quantity.unit}"']
     if quantity.low_admitted:
         low = quantity.low
-    elif np.isfinite(quantity.high) or quantity.low < 0.0:
-        logarithmic = False
+    elif quantity.low == 0.0 and not np.isfinite(quantity.high):
+        median, log_sd = np.sqrt(low * high), 0.5 * np.log(high / low) / _GUESSED
+        source = f"a guess, {low:.2g} to {high:.3g} as {_GUESSED:g} log-sd to each side"
+        return [*head, *prior_lines(median, round(log_sd, 2), source, "   # CHANGE: a guess")]
+    else:
         low = quantity.low if np.isfinite(quantity.low) else -20.0
         high = quantity.high if np.isfinite(quantity.high) else 20.0
         margin = 0.01 * (high - low)
         low, high = low + margin, high - margin
-    return [
-        f"[parameters.{quantity.name}]",
-        f'unit = "{quantity.unit}"',
-        f"range = [{low:.2g}, {high:.3g}]   # CHANGE: what you think possible",
-        *(['scale = "log"'] if logarithmic else []),
-    ]
+    return [*head, f"range = [{low:.2g}, {high:.3g}]   # CHANGE: what you think possible"]
 
 
 def _experiment_text(scene: str, table: str, sizes: _Sizes, notes: list[str]) -> str:

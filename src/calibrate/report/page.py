@@ -18,9 +18,12 @@ from calibrate.certificate.evidence import LARGEST_LOG_SD, LARGEST_MESH_SHIFT, L
 from calibrate.certificate.verdict import shifts
 from calibrate.posterior import Posterior
 from calibrate.posterior.posterior import describe_distribution
+from calibrate.priors.population import in_words as priors_in_words
+from calibrate.priors.priors import Truncated
 from calibrate.project import Run, holds_population, read_posterior, simulator_of
 from calibrate.project.members import read_members
 from calibrate.project.results import CERTIFICATE, REPORT
+from calibrate.project.stated_priors import stated_priors
 from calibrate.report import charts, parts, population
 from calibrate.report.body import body_figure
 from calibrate.report.parts import Verdict
@@ -146,6 +149,7 @@ def _parameters(
         for name, share in posterior.model.prior_cut.items()
         if share
     ]
+    notes += map(parts.note, priors_in_words(stated_priors(run, posterior.model)))
     return [parts.table(head, rows), *notes]
 
 
@@ -229,6 +233,9 @@ def _provenance(run: Run, posterior: Posterior) -> list[Markup]:
 
 def _in_words(prior: dist.Distribution) -> str:
     """Return a prior as its distribution's name and its range."""
+    whole = prior.base_dist if isinstance(prior, Truncated) else prior
+    if isinstance(whole, dist.LogNormal):
+        return f"log-normal, median {np.exp(whole.loc):.4g}, log sd {float(whole.scale):.2g}"
     if not isinstance(prior, dist.LogUniform | dist.Uniform):
         return describe_distribution(prior)
     log = "log-" if isinstance(prior, dist.LogUniform) else ""

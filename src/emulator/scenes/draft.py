@@ -2,15 +2,15 @@
 
 Sets are recognised by their names (base, fixed, endocardium, LV, ...), the unit of length by the
 size of the body. Where no set is a support, the largest flat face at an end of the body is held,
-or the end itself. The draft is a scene that can be simulated. Entries that nothing in the mesh
-suggests, such as the ranges of parameters, are marked CHANGE.
+or the end itself. The draft is a scene that can be simulated. Priors of parameters are those of
+published values, with their source. Entries that nothing suggests are marked CHANGE.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -28,8 +28,10 @@ from emulator.mechanics.laws import find_law
 from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.file import read_scene
 from emulator.scenes.loads import CavityPressure, FollowerPressure, Gravity, Load, SurfacePressure
+from emulator.scenes.parameter_space import LogNormal
 from emulator.scenes.scene import Scene, with_mesh
 from emulator.scenes.supports.dirichlet import Support, loose_parts
+from emulator.scenes.tissue_priors import OF_LAWS, PRESSURE
 
 _METRES = 0.6  # a body smaller than this in all directions is taken to be in m
 _SMALL = 25.0  # a body smaller than this might be in cm
@@ -47,21 +49,11 @@ _OUTSIDE = ("epi", "outer", "outside", "pericard", r"\bwall\b")
 _LEAST_FACE = 0.005  # of the surface; a flat face this large holds the body
 _LEAST_END = 0.15  # likewise of an end that is not flat
 _FLAT = 1e-8  # of the body's size
-# Ranges of known parameters: the paper's, textbook form.
-_RANGES = {
-    "a": (0.2, 0.52),
-    "b": (1.0, 4.2),
-    "a_f": (3.0, 10.36),
-    "b_f": (1.0, 4.46),
-    "mu": (3.5, 10.0),
-    "lam": (3.5, 10.0),
-    "C": (1.0, 4.0),
-    "pressure": (0.53, 1.33),
-    "right_pressure": (0.1, 0.4),
-}
-_CONSTANTS = {"kappa": 25.0}
+# Guesses where no published values are at hand, kPa or numbers.
+_RANGES = {"mu": (3.5, 10.0), "lam": (3.5, 10.0), "right_pressure": (0.1, 0.4)}
 _MODULUS, _NUMBER = (1.0, 10.0), (1.0, 5.0)
-_WEIGHT, _MOST_STRESS = 1.04e-2, 5.0  # kPa/mm; kPa, which the ranges stand
+_CONSTANTS = {"kappa": 25.0}
+_WEIGHT, _MOST_STRESS = 1.04e-2, 5.0  # kPa/mm; kPa, which the moduli stand
 _MOST_QUADRATIC = 20_000  # nodes that are simulated in seconds
 _LINEAR = (
     "the mesh has linear tetrahedra, which lock: a ventricle of them fills by a quarter too little"
@@ -134,7 +126,7 @@ def draft_scene(
     material, support = find_law(law), _support(mesh, notes)
     head = [
         f'law = "{material.name}"   # see docs/extending.md for others',
-        f"mesh = {_quoted(mesh_name)}",
+        f"mesh = {quoted(mesh_name)}",
         *_elements(mesh),
     ]
     if body.unused:
@@ -147,7 +139,8 @@ def draft_scene(
         sections.append(_fibres(mesh, walls, material.sheets))
     for loads, lines, note, stiffer in _loads(mesh):
         of_loads = [quantity for load in loads for quantity in load.quantities]
-        quantities = _quantities([*material.quantities, *of_loads], stiffer)
+        priors = {**OF_LAWS.get(material.name, {}), SurfacePressure.parameter: PRESSURE}
+        quantities = _quantities([*material.quantities, *of_loads], priors, stiffer)
         entries = "\n\n".join([*sections, support, lines, *quantities]) + "\n"
         all_notes = (*notes, note, *_unused(mesh, entries))
         out.write_text(_header(mesh, all_notes) + entries, encoding="utf-8")
@@ -177,7 +170,7 @@ def _in_mm(body: Body, path: Path, out: Path, unit: str, notes: list[str]) -> tu
     return replace(body, mesh=mesh), target.name
 
 
-def _quoted(name: str) -> str:
+def quoted(name: str) -> str:
     """Return a name as a string of TOML."""
     return json.dumps(name, ensure_ascii=False)
 
@@ -223,8 +216,8 @@ def _fibres(mesh: Mesh, walls: tuple[str, str] | None, with_sheets: bool) -> str
     return f"""[fibres]
 rule = "helix"
 angles = [60.0, -60.0]   # degrees, inside and outside
-endocardium = {_quoted(walls[0])}
-epicardium = {_quoted(walls[1])}
+endocardium = {quoted(walls[0])}
+epicardium = {quoted(walls[1])}
 {axis}"""
 
 
@@ -251,7 +244,7 @@ def _support(mesh: Mesh, notes: list[str]) -> str:
         notes.append(f"held at '{name}'")
         why = f"'{name}' alone leaves the body free to turn or move"
         components = '   # all components; see components = "z"'
-        sections.append(f"[[supports]]\nnode_set = {_quoted(name)}{components}")
+        sections.append(f"[[supports]]\nnode_set = {quoted(name)}{components}")
     loose = loose_parts(mesh, [Support(name)] if name else [])
     for k, (nodes, _) in enumerate(loose, start=1):
         letter, at, where = _end(mesh, nodes)
@@ -321,7 +314,7 @@ def _loads(mesh: Mesh) -> list[tuple[list[Load], str, str, float]]:
 
 def _pressure(load: SurfacePressure) -> str:
     """Return the lines of a pressure."""
-    lines = f'[[loads]]\nkind = "{load.kind}"\nfacet_set = {_quoted(load.facet_set)}\n'
+    lines = f'[[loads]]\nkind = "{load.kind}"\nfacet_set = {quoted(load.facet_set)}\n'
     if load.parameter != SurfacePressure.parameter:
         lines += f'parameter = "{load.parameter}"\n'
     return lines + "# pressure = 0.8   # kPa; without it, a parameter"
@@ -332,37 +325,61 @@ def _of_both(mesh: Mesh) -> bool:
     return set(BOTH) <= set(mesh.facet_sets)
 
 
-def _quantities(quantities: Sequence[Quantity], stiffer: float) -> list[str]:
-    """Return a table for each parameter, and that of the constants."""
+def _quantities(
+    quantities: Sequence[Quantity], priors: Mapping[str, LogNormal], stiffer: float
+) -> list[str]:
+    """Return a table for each parameter, and that of the constants.
+
+    priors : those from published values, by the parameter's name.
+    """
     sections, constants = [], []
     for quantity in quantities:
         if quantity.name in _CONSTANTS:
             constants.append(f"{quantity.name} = {_CONSTANTS[quantity.name] * stiffer}")
             continue
-        low, high = _RANGES.get(quantity.name, _MODULUS if quantity.unit else _NUMBER)
-        if quantity.unit == "kPa":
-            low, high = low * stiffer, high * stiffer
-        if not quantity.low < low < high < quantity.high:
-            span = quantity.high - quantity.low
-            low, high = quantity.low + 0.25 * span, quantity.low + 0.75 * span
-        scale = '\nscale = "log"' if low > 0.0 and "pressure" not in quantity.name else ""
+        raised = stiffer if quantity.unit == "kPa" else 1.0
         sections.append(
             f'[parameters.{quantity.name}]\nunit = "{quantity.unit}"\n'
-            f"range = [{low}, {high}]   # CHANGE: what you think possible{scale}"
+            + "\n".join(_prior(quantity, priors.get(quantity.name), raised))
         )
     return [*sections, *(["\n".join(["[constants]", *constants])] if constants else ())]
 
 
+def _prior(quantity: Quantity, published: LogNormal | None, raised: float) -> list[str]:
+    """Return the lines of a parameter's prior, whose median is ``raised`` by a factor.
+
+    A log-normal where the parameter is above zero and has no other limit, else a range.
+    """
+    by_weight = f", times {raised:g} to stand its weight" if raised > 1.0 else ""
+    if published is not None:
+        median, log_sd, source = published.median, published.log_sd, published.source
+        return prior_lines(raised * median, log_sd, source + by_weight)
+    low, high = _RANGES.get(quantity.name, _MODULUS if quantity.unit else _NUMBER)
+    low, high = raised * low, raised * high
+    if (quantity.low, quantity.high) == (0.0, np.inf):
+        source = f"a guess{by_weight}: log-sd 1"
+        return prior_lines(float(f"{np.sqrt(low * high):.2g}"), 1.0, source, "   # CHANGE: a guess")
+    if not quantity.low < low < high < quantity.high:
+        span = quantity.high - quantity.low
+        low, high = quantity.low + 0.25 * span, quantity.low + 0.75 * span
+    return [f"range = [{low}, {high}]   # CHANGE: what you think possible"]
+
+
+def prior_lines(median: float, log_sd: float, source: str, comment: str = "") -> list[str]:
+    """Return the lines of a log-normal prior in a parameter's table."""
+    return [f"median = {median:.4g}{comment}", f"log_sd = {log_sd:g}", f"source = {quoted(source)}"]
+
+
 def _unused(mesh: Mesh, text: str) -> list[str]:
     """Return a note on sets that the scene file does not use, and a load for them."""
-    names = [name for name in mesh.node_sets if _quoted(name) not in text]
+    names = [name for name in mesh.node_sets if quoted(name) not in text]
     facets = [name for name in names if name in mesh.facet_sets]
     if not names:
         return []
     entries = 'kind = "force", node_set = {}, resultant = [0.0, 0.0, 1.0] in N'
     if facets:
         entries = 'kind = "traction", facet_set = {}, traction = [0.0, 0.0, 1.0] in kPa'
-    entries = entries.format(_quoted((facets or names)[0]))
+    entries = entries.format(quoted((facets or names)[0]))
     return [f"not used: {', '.join(names)}; a force on one: [[loads]] with {entries}"]
 
 

@@ -17,14 +17,15 @@ from emulator.geometry.mesh import Mesh
 from emulator.geometry.refinement import to_quadratic
 from emulator.geometry.side_by_side import check_name, shifted, side_by_side
 from emulator.mechanics.laws import Law, find_law
+from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.forward_problem import ForwardProblem, directions_read
-from emulator.scenes.parameter_space import Parameter
+from emulator.scenes.parameter_space import LogNormal, Parameter
 from emulator.scenes.scene import Scene
 from emulator.scenes.tissue import FibreAngles
 
 if TYPE_CHECKING:  # pydantic is imported when a scene file is read, not with the package
     from emulator.core.schema import Source
-    from emulator.scenes.file_schema import Plane, SceneFile
+    from emulator.scenes.file_schema import ParameterTable, Plane, SceneFile
 
 Regions = np.ndarray | None
 Entries = dict[str, Any]
@@ -60,12 +61,30 @@ def read_scene(path: str | Path) -> ForwardProblem:
     make, of_body = _kind_of(file, source)(path.parent, file, law, source)
     parameters = []
     for name, entry in file.parameters.items():
-        with source.at("parameters", name):
-            parameters.append(Parameter(name, entry.unit, *entry.range, entry.scale))
+        with source.at("parameters", name, table=("parameters", name)):
+            parameters.append(_parameter(name, entry, law))
     try:
         return make(parameters=tuple(parameters), **entries, **of_body)
     except InputError as error:
         raise source.error(str(error), _quantity_in(str(error), file)) from error
+
+
+def _parameter(name: str, entry: ParameterTable, law: Law) -> Parameter:
+    """Return the parameter of a table, which has a range, or a median and a log_sd."""
+    keys = entry.model_fields_set - {"unit"}
+    if {"range", "scale"} & keys and {"median", "log_sd", "source"} & keys:
+        raise InputError(
+            f"it has {', '.join(sorted(keys))}; give range and scale, or median, log_sd and source"
+        )
+    if entry.range is not None:
+        return Parameter(name, entry.unit, *entry.range, entry.scale)
+    if entry.median is None or entry.log_sd is None:
+        raise InputError("give a range, or median and log_sd")
+    prior = LogNormal(entry.median, entry.log_sd, entry.source)
+    limit = next((q for q in law.quantities if q.name == name), Quantity(name))
+    if fault := limit.value_fault(entry.median):
+        raise InputError(f"median: {fault}")
+    return Parameter.log_normal(name, entry.unit, prior, limit.high)
 
 
 def _kind_of(file: SceneFile, source: Source) -> Callable[..., tuple[Any, Entries]]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from emulator.core.schema import OneOf, Table, json_schema
 from emulator.mechanics.laws import LAWS, Law
@@ -31,14 +31,25 @@ class Plane(Table):
 
 
 class ParameterTable(Table):
-    """A quantity that varies."""
+    """A quantity that varies, with a range or a log-normal prior."""
+
+    model_config = ConfigDict(json_schema_extra={"oneOf": [
+        {"required": ["range"]},
+        {"required": ["median", "log_sd"], "not": {"required": ["scale"]}},
+    ]})  # fmt: skip
 
     unit: str = ""
     """as law or load expect it, e.g. kPa; left out when dimensionless."""
-    range: tuple[float, float]
+    range: tuple[float, float] | None = None
     """lowest and highest value."""
     scale: Literal["log", "uniform"] = "uniform"
     """log to sample equal ratios equally."""
+    median: float | None = None
+    """median of its prior, a log-normal, in place of range."""
+    log_sd: float | None = None
+    """sd of the prior's logarithm, about its relative sd; the range is one to each side."""
+    source: str = ""
+    """where the prior is from, in words."""
 
 
 class BodyTable(Table):

@@ -54,6 +54,11 @@ class ForwardProblem(TableRepr):
     table: Cells | None = None
 
     @property
+    def learned_in_box(self) -> bool:
+        """Whether something of it was learned, and holds, in the box of theta only."""
+        return False
+
+    @property
     @abstractmethod
     def node_count(self) -> int:
         """The number of points whose displacement a forward map predicts."""

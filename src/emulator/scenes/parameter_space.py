@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -22,6 +22,32 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.errors import InputError
+
+_LARGEST_LOG_SD = 10.0  # a factor of 20 000 to each side
+_SHORT_OF = 0.999  # share of the way from a median to a limit that a range may go
+
+
+@dataclass(frozen=True)
+class LogNormal:
+    """A prior of a parameter above zero.
+
+    Parameters
+    ----------
+    median : its median, in the parameter's unit.
+    log_sd : the sd of its logarithm, about its relative sd.
+    source : where both are from, in words.
+    """
+
+    median: float
+    log_sd: float
+    source: str = field(default="", compare=False)
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.median < math.inf:
+            raise InputError(f"median is {self.median:g}; it must be above 0 and finite")
+        if not 0.0 < self.log_sd <= _LARGEST_LOG_SD:
+            most = f"it must be above 0 and at most {_LARGEST_LOG_SD:g}"
+            raise InputError(f"log_sd is {self.log_sd:g}; {most}")
 
 
 @dataclass(frozen=True)
@@ -34,6 +60,7 @@ class Parameter:
     unit : as the law or the load expects it, e.g. ``kPa``; empty when dimensionless.
     low, high : its range.
     scale : ``log`` to sample equal ratios equally, else ``uniform``.
+    prior : what is known of its value before any data; None where that is its range.
     """
 
     name: str
@@ -41,6 +68,19 @@ class Parameter:
     low: float
     high: float
     scale: Literal["log", "uniform"] = "uniform"
+    prior: LogNormal | None = None
+
+    @classmethod
+    def log_normal(
+        cls, name: str, unit: str, prior: LogNormal, below: float = math.inf
+    ) -> Parameter:
+        """Return the parameter whose range is one sd of the prior's logarithm to each side.
+
+        below : the limit below which its values stay by nature.
+        """
+        step = math.exp(prior.log_sd)
+        most = prior.median + _SHORT_OF * (below - prior.median)
+        return cls(name, unit, prior.median / step, min(prior.median * step, most), "log", prior)
 
     def __post_init__(self) -> None:
         if not -math.inf < self.low < self.high < math.inf:
@@ -82,8 +122,8 @@ class Parameter:
         return replace(self, low=max(self.low - half, least), high=self.high + half)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the arguments of the constructor as plain JSON."""
-        return asdict(self)
+        """Return the arguments of the constructor but the prior as plain JSON."""
+        return {name: value for name, value in asdict(self).items() if name != "prior"}
 
 
 _SLACK = 1e-9  # round-off allowed, as a fraction of a range

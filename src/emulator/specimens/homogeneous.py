@@ -291,10 +291,12 @@ HOMOGENEOUS = ForwardKind(
     "states of a specimen, without a mesh",
     lambda ingredients, _: homogeneous(require_specimen(ingredients.scene)),
     closer="",
+    anywhere=True,
 )
 INCOMPRESSIBLE = ForwardKind(
     "incompressible",
     "the same, without changes of volume",
     lambda ingredients, _: homogeneous(require_specimen(ingredients.scene), incompressible=True),
     closer="--forward homogeneous",
+    anywhere=True,
 )

@@ -96,6 +96,11 @@ class Specimen(ForwardProblem):
     table: Cells | None = None
     homogeneous: bool = False
 
+    @property
+    def learned_in_box(self) -> bool:
+        """Whether stresses of grips were learned in the box of theta."""
+        return self.grips is not None and self.grips.learned is not None
+
     def __post_init__(self) -> None:
         H, free, pulls, tests = self.states
         count = len(free)

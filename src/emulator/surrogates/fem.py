@@ -97,4 +97,5 @@ FEM = ForwardKind(
     "fem",
     "finite elements, from rest each time",
     lambda ingredients, _: by_solver(ingredients.simulator),
+    anywhere=True,
 )

@@ -169,6 +169,7 @@ class ForwardKind:
         raises ``KeyError`` where one is missing. ``None`` for a kind that is not fitted.
     words : the further words that have an effect: ``emulator`` where one is an ingredient.
     closer : words on the map to take where this one is too far from FEM; none for an exact one.
+    anywhere : whether its maps answer outside of their scene's box, too.
     """
 
     name: str
@@ -181,3 +182,4 @@ class ForwardKind:
     closer: str = (
         "--forward rounds (FEM where the posterior is) or corrected (or more of its --steps)"
     )
+    anywhere: bool = False

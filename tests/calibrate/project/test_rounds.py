@@ -1,15 +1,16 @@
 """Rounds of FEM runs find a posterior that nobody's range contains, and teach an emulator there."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 import calibrate as cal
 import emulator as em
 from calibrate.cli import main
-from calibrate.priors import Population
+from calibrate.priors import Population, prior_of
 from calibrate.priors.wide import completed, wide_prior, widened
 from calibrate.project import (
     Run,
@@ -20,6 +21,8 @@ from calibrate.project import (
     read_problem,
     simulator_of,
 )
+from calibrate.report.charts import traces
+from calibrate.report.page import html_of
 from calibrate.statistical_model.fem_likelihood import FEMLikelihood
 from emulator.core.errors import InputError, SolverError
 from emulator.fem.campaign import workers
@@ -247,3 +250,83 @@ def test_the_finer_mesh_of_a_built_in_body_is_inferred_on_and_read_again(tmp_pat
     for name, value in TRUTH.items():
         row = posterior.summary()[name]
         assert abs(row["mean"] - value) < 3.0 * row["sd"], name
+
+
+STATED = OWN.replace(
+    'mu = {unit = "kPa", range = [50, 100]}',
+    'mu = {unit = "kPa", median = 200, log_sd = 0.5, source = "a book"}',
+)
+
+
+@pytest.fixture
+def stated(tmp_path):
+    """A scene file that states the prior of mu, and has a range of lam."""
+    assert STATED != OWN
+    em.write_mesh(tmp_path / "own.vtu", em.generators.box((100.0, 10.0, 10.0), (4, 1, 1)))
+    (tmp_path / "own.toml").write_text(STATED)
+    return replace(RUN, scene=str(tmp_path / "own.toml"), forward="emulator")
+
+
+def test_rounds_have_the_prior_that_a_scene_states(stated):
+    problem = by_rounds(read_problem(stated))
+    assert problem.run.forward == "rounds"
+    prior = problem.run.prior
+    assert prior["median"] == pytest.approx({"mu": 200.0, "lam": 75.0})
+    assert (prior["log_sd"]["mu"], prior["source"]["mu"]) == (0.5, "a book")
+    assert "the scene's range" in prior["source"]["lam"]
+    mu, lam = problem.scene.parameters
+    sides = 3.72 * np.array([-0.5, 0.5])
+    np.testing.assert_allclose([mu.low, mu.high], 200.0 * np.exp(sides))
+    distribution = prior_of(prior, problem.scene)["mu"]
+    x = np.array([80.0, 200.0, 500.0])
+    exact = norm.logpdf(np.log(x), np.log(200.0), 0.5) - np.log(x)
+    np.testing.assert_allclose(distribution.log_prob(x), exact, atol=3e-4)  # cut at 3.72 sd
+    assert lam.high > 75.0 * np.exp(3.7 * np.log(2.0))
+    again = read_problem(problem.run)  # as from run.json
+    assert again.run.prior == prior
+    assert again.scene.fingerprint == problem.scene.fingerprint
+
+
+def test_a_run_overrules_a_scene_and_known_parameters_have_no_prior(stated):
+    own = asdict(Population({"mu": 100.0}, {"mu": 0.2}, source="ours"))
+    prior = by_rounds(read_problem(replace(stated, prior=own))).run.prior
+    assert (prior["median"]["mu"], prior["source"]["mu"]) == (100.0, "ours")
+    known = replace(stated, known={"mu": 190.0}, truth={"lam": 33.0})
+    assert set(by_rounds(read_problem(known)).run.prior["median"]) == {"lam"}
+    with pytest.raises(InputError, match="'mu' is known and has a prior"):
+        by_rounds(read_problem(replace(known, prior=own)))
+    with pytest.raises(InputError, match="bounded: scene 'own' has a prior of 'mu'"):
+        read_problem(replace(stated, bounded=("mu",)))
+
+
+def test_fem_has_the_prior_that_a_scene_states_and_an_emulator_a_part_of_it(stated):
+    by_fem = read_problem(replace(stated, forward="fem"))
+    assert set(by_fem.run.prior["median"]) == {"mu"}  # and lam its range
+    assert by_fem.scene.parameters[0].high == pytest.approx(200.0 * np.exp(3.72 * 0.5))
+    assert by_fem.scene.parameters[1] == em.find_scene(stated.scene).parameters[1]
+    problem = read_problem(stated)
+    assert problem.run.prior == "box"
+    x = np.array([200.0 * np.exp(-0.51), 200.0, 250.0])
+    exact = norm.logpdf(np.log(x), np.log(200.0), 0.5) - np.log(x) - np.log(norm.cdf([1]) * 2 - 1)
+    exact[0] = -np.inf  # beyond the training
+    np.testing.assert_allclose(cal.priors.box_prior(problem.scene)["mu"].log_prob(x), exact)
+
+
+def test_the_table_of_results_says_where_priors_are_from(stated, tmp_path, capsys):
+    words = ["--truth", "mu=190", "lam=60", "--observe", "nodes:9", "--noise", "0.2"]
+    run = ["infer", stated.scene, *words, "--draws", "200", "--no-certify"]
+    main([*run, "--out", str(tmp_path / "r")])
+    printed = capsys.readouterr().out
+    assert "prior median of mu 200 (log sd 0.5): a book" in printed
+    assert "prior median of lam 75 (log sd 0.69): the scene's range" in printed
+    kept = json.loads((tmp_path / "r" / "run.json").read_text())["prior"]
+    assert kept["source"]["mu"] == "a book"
+    run, posterior = read_posterior(tmp_path / "r")
+    page = html_of(run, posterior, None, fem=False)
+    assert "prior median of mu 200 (log sd 0.5): a book" in page
+    assert "log-normal, median 200, log sd 0.5" in page
+    draws = {n: np.asarray(posterior.tree["posterior"][n]) for n in ("mu", "lam")}
+    figure = traces(dict.fromkeys(draws, "label"), draws, posterior.model.sampled_priors)
+    line = next(trace for trace in figure.data if trace.name == "prior")
+    exact = norm.pdf(np.log(line.x), np.log(200.0), 0.5) / line.x
+    np.testing.assert_allclose(line.y, exact, rtol=1e-3)

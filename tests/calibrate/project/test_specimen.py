@@ -1,8 +1,10 @@
 """From a test's table to a posterior with FEM's verdict, by the commands a user types."""
 
 import json
+import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +14,14 @@ import calibrate as cal
 import emulator as em
 from calibrate.cli import main
 from calibrate.measurements.data import read_measurements
+from calibrate.project import model_before_data, read_posterior
 from calibrate.project.experiment import read_experiment
 from calibrate.project.problem import simulator_of
 from calibrate.project.specimen import draft_specimen
+from calibrate.project.stated_priors import without_box
 from emulator.core.errors import InputError
 from emulator.scenes.file import read_scene
+from emulator.specimens.grips import Grips, GripStresses
 
 A, B = 8.0, 6.0  # W = a (exp(b (I1 - 3)) - 1) / 2 b
 
@@ -313,3 +318,48 @@ def test_a_test_without_any_stretch_is_refused(tmp_path):
     (tmp_path / "test.csv").write_text("applied_x,stretch_x\n0,1\n2,1\n")
     with pytest.raises(InputError, match="each stretch is 1"):
         draft_specimen(tmp_path / "test.csv", tmp_path / "test.toml")
+
+
+def test_a_specimen_has_the_priors_that_its_scene_states(tmp_path, monkeypatch):
+    """Its solver needs no box: the prior is not cut at the range that a training would cover."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "test.csv").write_text(table(noise=0.3))
+    assert main(["init", "test.csv", "--law", "holzapfel_ogden_isotropic"]) == 0
+    text = (tmp_path / "test_scene.toml").read_text()
+    assert "range" not in text
+    assert text.count("# CHANGE: a guess") == 2
+    a, _ = read_scene(tmp_path / "test_scene.toml").parameters
+    problem = read_experiment(tmp_path / "test.toml")
+    assert problem.run.prior["median"]["a"] == a.prior.median
+    model = model_before_data(problem)
+    far = {"a": a.prior.median * np.exp(2.5 * a.prior.log_sd), "b": 2.0}  # of the range, one sd
+    assert np.isfinite(model.prior["a"].log_prob(far["a"]))
+    assert bool(model.predict(far)[1])
+    assert not model.boxed
+
+
+@pytest.mark.slow
+def test_a_specimens_truth_may_be_far_from_its_prior(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "test.csv").write_text(table(noise=0.3))
+    assert main(["init", "test.csv", "--law", "holzapfel_ogden_isotropic"]) == 0
+    text = (tmp_path / "test_scene.toml").read_text()
+    text = re.sub(r"median = [^ ]+ .*\nlog_sd = .*", "median = 1.0\nlog_sd = 1.0", text)
+    (tmp_path / "test_scene.toml").write_text(text)
+    assert main(["infer", "test.toml", "--out", "run", "--no-certify", "--json"]) == 0
+    _, posterior = read_posterior("run")
+    for name, truth in (("a", A), ("b", B)):  # at 2.1 and 1.8 sd, the range at one
+        row = posterior.summary()[name]
+        assert abs(row["mean"] - truth) < 4.0 * row["sd"]
+
+
+def test_what_grips_do_is_known_in_their_box_only(tmp_path):
+    """So the prior is cut there, and the end of the box is one that a posterior may end at."""
+    (tmp_path / "test.csv").write_text(table())
+    scene = draft_specimen(tmp_path / "test.csv", tmp_path / "test.toml").scene
+    learned = GripStresses(np.zeros((1, 4)), np.zeros((1, 18, 3, 3)), 0.0, "")
+    gripped = replace(scene, homogeneous=False, grips=Grips((10.0, 10.0, 1.0), learned=learned))
+    run = read_experiment(tmp_path / "test.toml").run
+    asked = replace(run, prior="box")
+    assert without_box(asked, gripped) == (asked, gripped)
+    assert without_box(asked, scene)[0].prior["median"]

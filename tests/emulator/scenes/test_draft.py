@@ -13,9 +13,11 @@ from emulator.geometry.generators.ellipsoid import human_ventricle
 from emulator.geometry.io import write_mesh
 from emulator.geometry.mesh import Mesh
 from emulator.geometry.refinement import to_quadratic
+from emulator.mechanics.laws import LAWS
 from emulator.scenes.draft import draft_scene
 from emulator.scenes.fibre_rules import Helix
 from emulator.scenes.loads import CavityPressure, FollowerPressure, Gravity
+from emulator.scenes.tissue_priors import OF_LAWS
 
 
 @pytest.fixture
@@ -35,7 +37,12 @@ def test_a_ventricle_of_named_groups(ventricle_file):
     np.testing.assert_allclose(np.abs(scene.fibres), np.abs(reference), atol=1e-6)
     assert "its walls are named" in " ".join(made.notes)
     text = made.path.read_text()
-    assert "# CHANGE: what you think possible" in text
+    assert "range = " not in text
+    assert "CHANGE: " not in text  # nothing was guessed
+    for parameter in scene.parameters:  # the range follows from the prior, which has its source
+        prior, sides = parameter.prior, np.exp([-parameter.prior.log_sd, parameter.prior.log_sd])
+        np.testing.assert_allclose([parameter.low, parameter.high], prior.median * sides)
+        assert "human left ventricles" in prior.source
     assert "#   endocardium: " in text
 
 
@@ -78,6 +85,11 @@ def test_a_bare_block_hangs_by_its_end(tmp_path):
     other = draft_scene(tmp_path / "block.vtu", tmp_path / "other.toml", law="neo_hookean_E_nu")
     nu = other.scene.parameters[1]
     assert (nu.name, nu.low < nu.high < 0.5) == ("nu", True)
+    assert nu.prior is None
+    text = (tmp_path / "other.toml").read_text()
+    assert text.count("# CHANGE: what you think possible") == 1  # of nu
+    assert text.count("# CHANGE: a guess") == 1  # of E
+    assert other.scene.parameters[0].prior.source == "a guess: log-sd 1"
 
 
 def test_sets_that_are_not_used_are_named(tmp_path):
@@ -156,7 +168,25 @@ def test_round_bodies_and_loose_parts_are_held(tmp_path):
 def test_large_bodies_get_moduli_that_stand_their_weight(tmp_path):
     write_mesh(tmp_path / "beam.vtu", replace(box((400.0, 20.0, 20.0), (8, 1, 1)), node_sets={}))
     made = draft_scene(tmp_path / "beam.vtu", tmp_path / "beam.toml")
-    assert made.scene.parameters[0].low == 50 * 3.5
+    prior = made.scene.parameters[0].prior
+    assert prior.median == pytest.approx(50 * np.sqrt(3.5 * 10.0), rel=0.02)
+    assert (prior.log_sd, prior.source) == (1.0, "a guess, times 50 to stand its weight: log-sd 1")
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_every_law_has_priors_that_a_scene_takes(tmp_path, law):
+    """Published ones name parameters of the law; a scene with them is read again."""
+    assert set(OF_LAWS.get(law, {})) <= set(LAWS[law].parameters) - {"kappa"}
+    mesh = box((4.0, 1.0, 1.0), (4, 2, 2))
+    along, across = (np.tile(d, (len(mesh.elements), 1)) for d in np.eye(3)[:2])
+    write_mesh(tmp_path / "b.vtu", mesh, along, across)
+    scene = draft_scene(tmp_path / "b.vtu", tmp_path / "b.toml", law=law).scene
+    of = {parameter.name: parameter.prior for parameter in scene.parameters}
+    for name, prior in OF_LAWS.get(law, {}).items():
+        assert (of[name].median, of[name].log_sd) == pytest.approx((prior.median, prior.log_sd))
+        assert of[name].source == prior.source
+    positive = {q.name for q in scene.law.quantities if (q.low, q.high) == (0.0, np.inf)}
+    assert {name for name, prior in of.items() if prior is not None} == positive - {"kappa"}
 
 
 def test_a_refused_draft_leaves_no_file(tmp_path, capsys):

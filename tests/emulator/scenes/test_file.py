@@ -44,6 +44,9 @@ def test_a_scene_from_a_file(folder):
     assert scene_from_origin(scene.origin).fingerprint == scene.fingerprint
 
 
+RANGE = 'range = [5, 20]\nscale = "log"'
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -160,6 +163,18 @@ def test_a_scene_from_a_file(folder):
             "cavity 'end': rim node .* is not held.*use FollowerPressure",
         ),
         ("range = [5, 20]", "range = [20, 5]", "range .* is empty"),
+        (RANGE, "", r"\[parameters.mu\]: give a range, or median and log_sd"),
+        (RANGE, "median = 9", r"\[parameters.mu\]: give a range, or median and"),
+        ("range = [5, 20]", "range = [5, 20]\nmedian = 9", "it has median, range, scale; give"),
+        (
+            "range = [5, 20]",
+            "median = 9\nlog_sd = 1",
+            "it has log_sd, median, scale; give range and scale, or median, log_sd and source",
+        ),
+        (RANGE, "median = 0\nlog_sd = 1", "median is 0; it must be above 0"),
+        (RANGE, "median = 9\nlog_sd = 0", "log_sd is 0; it must be above 0"),
+        (RANGE, "median = 9\nlog_sd = 900", "log_sd is 900; .* at most 10"),
+        (RANGE, 'median = "9"\nlog_sd = 1', 'median = "9"; expected a number'),
         ("lam = 30.0", "lam = ", "is not valid TOML"),
     ],
 )
@@ -311,3 +326,44 @@ def test_unknown_names(tmp_path):
         find_scene("published:OnceClampedBeam")
     with pytest.raises(InputError, match="origin names scene 'None'"):
         scene_from_origin({})
+
+
+PRIOR = 'median = 9\nlog_sd = 0.5\nsource = "a book"'
+
+
+def test_a_parameter_may_have_a_prior_in_place_of_a_range(folder):
+    (folder / "scene.toml").write_text(SCENE.replace(RANGE, PRIOR))
+    (mu,) = find_scene(str(folder / "scene.toml")).parameters
+    assert (mu.prior.median, mu.prior.log_sd, mu.prior.source) == (9.0, 0.5, "a book")
+    assert (mu.low, mu.high) == pytest.approx((9.0 * np.exp(-0.5), 9.0 * np.exp(0.5)))
+    assert mu.scale == "log"
+
+
+def test_the_range_of_a_prior_ends_before_what_nature_does_not_allow(folder):
+    text = SCENE.replace('law = "neo_hookean"', 'law = "neo_hookean_E_nu"').replace("lam =", "E =")
+    text = text.replace('[parameters.mu]\nunit = "kPa"\n' + RANGE, f"[parameters.nu]\n{PRIOR}")
+    path = folder / "scene.toml"
+    path.write_text(text.replace("median = 9", "median = 0.45"))
+    (nu,) = find_scene(str(path)).parameters
+    assert 0.45 < nu.high < 0.5
+    assert nu.low == pytest.approx(0.45 * np.exp(-0.5))
+    path.write_text(text.replace("median = 9", "median = 0.5"))
+    with pytest.raises(InputError, match="median: parameter 'nu' is 0.5; it must be below 0.5"):
+        find_scene(str(path))
+
+
+def test_a_prior_is_in_the_fingerprint_by_its_numbers(folder):
+    """Scenes with a range keep theirs, and an emulator of a prior's range serves that range."""
+
+    def fingerprint(entries):
+        (folder / "scene.toml").write_text(SCENE.replace(RANGE, entries))
+        return find_scene(str(folder / "scene.toml")).fingerprint
+
+    stated = fingerprint(PRIOR)
+    assert fingerprint(PRIOR.replace("a book", "another")) == stated
+    low, high = 9.0 * np.exp(-0.5), 9.0 * np.exp(0.5)
+    assert fingerprint(f'range = [{float(low)!r}, {float(high)!r}]\nscale = "log"') == stated
+    for other in ("median = 8", "log_sd = 0.6"):
+        key = other.split(" = ")[0]
+        changed = "\n".join(other if line.startswith(key) else line for line in PRIOR.split("\n"))
+        assert fingerprint(changed) != stated

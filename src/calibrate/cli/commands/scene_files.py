@@ -88,7 +88,7 @@ def _weight_notes(scene: Scene) -> Iterator[str]:
     nodes = scene.mesh.nodes
     if scene.load_parameters or len(nodes) > _SOLVED_SOON:  # a guessed pressure is a parameter
         return
-    remedy = "raise the ranges of its moduli, hold it elsewhere, or give the load that you know"
+    remedy = "raise the medians of its moduli, hold it elsewhere, or give the load that you know"
     solution = Simulator(scene).solve(scene.centre)
     if not solution.converged:
         yield f"CHANGE: FEM finds no equilibrium under its own weight: {remedy}"

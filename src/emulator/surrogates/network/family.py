@@ -266,7 +266,7 @@ class FamilyNetwork:
         return {
             "architecture": asdict(learned.architecture),
             "scale": learned.scale,
-            "parameters": [asdict(parameter) for parameter in learned.parameters],
+            "parameters": [parameter.to_json() for parameter in learned.parameters],
             "pressure": learned.pressure,
             "physics": learned.physics,
             "shapes": learned.shapes,
