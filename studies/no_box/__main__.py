@@ -61,6 +61,7 @@ class Body:
     known: dict[str, float] = field(default_factory=dict)
 
 
+NATURE = {"nu": 0.49}  # where a truth ends
 BODIES = {
     "beam": Body("once_clamped_beam", "nodes:20", {"displacement": 0.2}),
     "twisting cube": Body("twisting_cube", "nodes:20", {"displacement": 0.05}),
@@ -81,7 +82,10 @@ def truth_of(scene: em.Scene, number: int) -> dict[str, float]:
     for k, parameter in enumerate(scene.parameters):
         if parameter.low > 0.0:
             width = max(0.5 * np.log(parameter.high / parameter.low), np.log(2.0))
-            drawn[parameter.name] = float(scene.centre[k] * np.exp(width * rng.normal()))
+            value = np.inf
+            while value >= NATURE.get(parameter.name, np.inf):
+                value = float(scene.centre[k] * np.exp(width * rng.normal()))
+            drawn[parameter.name] = value
         else:
             drawn[parameter.name] = float(rng.uniform(parameter.low, parameter.high))
     return drawn

@@ -18,11 +18,11 @@ r"""A check of a posterior against FEM, with as many solves as decide.
 Given the training runs, the tests are independent draws from a known density: the errors are honest
 however good or bad the correction is, and small where it is good.
 
-3. **Decide.** The check begins with 70 runs, with 40 where runs before it have taught the map
-   (:mod:`calibrate.project.rounds`): these train the correction, too. While they leave the verdict
-   undecided there are twice as many, up to 200: the earlier ones train, and fresh points test. A
-   figure is compared with its limit at each look, with an error wide enough for these three
-   (:mod:`calibrate.certificate.verdict`).
+3. **Decide.** The check begins with 70 runs, with 50 where runs before it have taught the map
+   (:mod:`calibrate.project.rounds`): these train the correction, too, and fewer go where it is
+   uncertain. While they leave the verdict undecided there are twice as many, up to 200: the earlier
+   ones train, and fresh points test. A figure is compared with its limit at each look, with an
+   error wide enough for these three (:mod:`calibrate.certificate.verdict`).
 """
 
 from __future__ import annotations
@@ -50,11 +50,13 @@ from emulator.fem.solution import EquilibriumSolver
 from emulator.surrogates.correction import Correction
 
 _BEGIN, _AT_MOST = 70, 200  # FEM runs by default
-_BEGIN_TAUGHT = 40  # of a map that FEM runs have taught where the posterior is
+_BEGIN_TAUGHT = 50  # of a map that FEM runs have taught where the posterior is
 _FEWEST = 25
 # Shares of the runs that train the correction; the others test it.
 _AT_DRAWS, _AROUND, _AT_PRIOR, _DESCENTS, _ADAPTIVE = 0.15, 0.1, 0.1, 0.08, 0.12
 _FEWEST_DESCENTS = 16  # runs with which descents reach an end
+_FEWEST_AT_PRIOR = 7
+_ADAPTIVE_TAUGHT = 0.04  # in place of _ADAPTIVE
 _ROUNDS = 5  # rounds of adaptive runs
 _STABILITY = 20  # draws at which the sign of the tangent is examined
 
@@ -110,6 +112,7 @@ def examine(
     taught_at = posterior.taught_at()
     begin = _BEGIN_TAUGHT if taught_at else _BEGIN
     count, most = _checked_counts(draws, at_most, mesh, begin)
+    fewest = min(_FEWEST_AT_PRIOR, max(count // 7, 4))
     stages = Stages(show=False) if stages is None else stages
     predictive = Predictive(posterior.model, posterior.data, posterior.draws())
     rng = np.random.default_rng(seed)
@@ -126,10 +129,10 @@ def examine(
             # the prior are too far apart to show.
             surroundings = Kernels.surrounding(z, rng).sample(rng, max(round(_AROUND * count), 4))
             around = solver(surroundings, slopes=True)
-            prior = predictive.prior_draws(key_from(rng), max(round(_AT_PRIOR * count), 4))
+            prior = predictive.prior_draws(key_from(rng), max(round(_AT_PRIOR * count), fewest))
             at_prior = solver(prior, slopes=True)
             # Only descents of FEM's own misfit lead to a mode that the map hides altogether.
-            descending = max(round(_DESCENTS * count), min(_FEWEST_DESCENTS, count // 6))
+            descending = max(round(_DESCENTS * count), min(_FEWEST_DESCENTS, count // 5))
             descents, modes = descend(solver, at_prior, at_draws, z, descending, rng)
         training, total = FEMRuns.joined([at_draws, around, at_prior, descents]), count
         known = [FEMRuns.of_map(predictive, predictive.unconstrain(taught_at))] if taught_at else []
@@ -202,7 +205,8 @@ def _train(
         return correction_from(every, predictive, most + len(every.z) - len(runs.z))
 
     pool = Pool.search(predictive, corrected(runs), z, modes, rng)
-    for size in _rounds(max(round(_ADAPTIVE * count), 1)):
+    share = _ADAPTIVE_TAUGHT if known else _ADAPTIVE
+    for size in _rounds(max(round(share * count), 1)):
         chances = tempered(pool.log_explored, MOST_TEMPERED)
         if chances.any():
             points = pool.z[rng.choice(len(pool.z), size=size, p=chances)]
@@ -210,7 +214,7 @@ def _train(
         pool = pool.corrected_by(corrected(runs))
         if effective(normalised(pool.log_explored)) < MOST_TEMPERED:
             pool = pool.stepped(pool.log_explored, rng)
-    return runs, pool.polished(rng).redrawn(rng)
+    return runs, pool.polished(rng).drawn_again(rng)
 
 
 def _rounds(count: int) -> list[int]:

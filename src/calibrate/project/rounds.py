@@ -24,7 +24,7 @@ The certificate judges the posterior, by FEM runs of its own.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -34,6 +34,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from scipy.special import chdtri
+from tqdm import tqdm
 
 from calibrate.certificate.runs import FEMRunner, FEMRuns, correction_from, least_likely
 from calibrate.importance.proposals import key_from
@@ -114,9 +115,7 @@ def teach(
     SolverError
         FEM fails at most points of the prior.
     """
-    rng = np.random.default_rng([seed, 2])
     kept = {} if keep is None else _read(keep, simulator.scene.fingerprint)
-    rounds = list[Round]()
     with (
         one_blas_thread(),
         counting(
@@ -133,21 +132,8 @@ def teach(
                 _write(keep, kept, simulator.scene.fingerprint)
             return answers
 
-        began = time.perf_counter()
-        runs = ask(_spread_over_prior(predictive, min(_BEGIN, most), rng))
-        _require_half(runs)
-
-        def is_late() -> bool:
-            """Return whether a round as slow as those before would end too late."""
-            now = time.perf_counter()
-            return now + (now - began) * _A_ROUND / len(runs.z) > deadline
-
-        while len(runs.z) < most and not _are_foreseen(rounds) and not is_late():
-            fresh, predicted, drawn = _fresh_points(predictive, runs, most, rng)
-            answers = ask(fresh[: most - len(runs.z)])
-            rounds.append(_judged(runs, answers, predicted, drawn))
-            runs = FEMRuns.joined([runs, answers])
-            bar.set_postfix_str(f"log likelihoods missed by {rounds[-1].missed:.2g}")
+        rng = np.random.default_rng([seed, 2])
+        runs, rounds = _in_rounds(predictive, ask, most, deadline, rng, bar)
         bar.close()
         learned = correction_from(runs, predictive, most).of_scaled(*predictive.scale_of_features)
     emulator, record = add_discrepancy(Emulator(simulator.scene), _runs_of(kept))
@@ -156,6 +142,33 @@ def teach(
     rounds_record = {ROUNDS_RECORD: [asdict(r) for r in rounds], TAUGHT_AT: taught_at}
     record = {"discrepancy": record, **rounds_record}
     return taught(replace(emulator, record=record), replace(blank, correction=learned))
+
+
+def _in_rounds(
+    predictive: Predictive,
+    ask: Callable[[np.ndarray], FEMRuns],
+    most: int,
+    deadline: float,
+    rng: np.random.Generator,
+    bar: tqdm,
+) -> tuple[FEMRuns, list[Round]]:
+    """Return all runs, and the rounds, of which the last two foresaw FEM or time or runs ended."""
+    began, rounds = time.perf_counter(), list[Round]()
+    runs = ask(_spread_over_prior(predictive, min(_BEGIN, most), rng))
+    _require_half(runs)
+
+    def is_late() -> bool:
+        """Return whether a round as slow as those before would end too late."""
+        now = time.perf_counter()
+        return now + (now - began) * _A_ROUND / len(runs.z) > deadline
+
+    while len(runs.z) < most and not _are_foreseen(rounds) and not is_late():
+        fresh, predicted, drawn = _fresh_points(predictive, runs, most, rng)
+        answers = ask(fresh[: most - len(runs.z)])
+        rounds.append(_judged(runs, answers, predicted, drawn))
+        runs = FEMRuns.joined([runs, answers])
+        bar.set_postfix_str(f"log likelihoods missed by {rounds[-1].missed:.2g}")
+    return runs, rounds
 
 
 def _before_runs(model: Model, scene: Scene) -> tuple[Model, DataProcess]:

@@ -35,7 +35,7 @@ from emulator.fem.derivatives import (
     sensitivities,
 )
 from emulator.fem.energy import require_shape
-from emulator.fem.linear.suitesparse import on_all_cores, prepare
+from emulator.fem.linear.suitesparse import prepare
 from emulator.fem.loaded import LoadedEquilibrium
 from emulator.fem.newton import NewtonOptions
 from emulator.fem.reactions import balanced, nodes_of, reactions
@@ -126,8 +126,7 @@ class Simulator(TableRepr):
         theta, u = self._check_state(theta, self.rest if start is None else start)
         if self.scene.loaded_by:
             return self._loaded.solve(theta, None if start is None else u)
-        with on_all_cores(u.size):
-            return jax.block_until_ready(self._equilibrium(theta, jax.lax.stop_gradient(u)))
+        return jax.block_until_ready(self._equilibrium(theta, jax.lax.stop_gradient(u)))
 
     def path(self, thetas: jax.Array) -> Solution:
         """Return the equilibria along a path of theta (m, p), such as a loading curve.

@@ -140,7 +140,7 @@ def test_only_a_scene_without_an_emulator_gets_rounds():
 
 def test_a_wide_prior_has_the_range_as_one_sd_and_keeps_what_is_stated():
     scene = em.scenes.once_clamped_beam(cells=(4, 1, 1), order=1)
-    wide = wide_prior(scene, without=["lam"])
+    wide = wide_prior(scene, bounded=["lam"])
     assert wide.median == pytest.approx({"mu": np.sqrt(5000.0)})
     assert wide.log_sd["mu"] == pytest.approx(np.log(2.0))  # 50 to 100 kPa is half of that
     stated = Population({"mu": 20.0}, {"mu": 0.3})

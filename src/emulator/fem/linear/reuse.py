@@ -16,7 +16,13 @@ import jax.numpy as jnp
 
 from emulator.fem.compiled import compiled, while_loop
 from emulator.fem.linear.pattern import Pattern
-from emulator.fem.linear.suitesparse import Outcome, Solved, factor_and_solve, keeping_factors
+from emulator.fem.linear.suitesparse import (
+    Outcome,
+    Solved,
+    factor_and_solve,
+    keeping_factors,
+    on_all_cores,
+)
 
 TOLERANCE = 1e-10  # relative residual, in the norm of the inverse factorised tangent
 _PATIENCE = 6  # iterations before conjugate gradients that converge too slowly are given up
@@ -126,7 +132,8 @@ class KeptFactor:
             if bool(solution.convex & (solution.reduction <= TOLERANCE)):
                 return solution.x, jnp.asarray(Outcome.OK, jnp.int32)
         self._factorised = None
-        with keeping_factors(1):  # two factors of a large mesh may not fit into memory
+        # Two factors of a large mesh may not fit into memory.
+        with on_all_cores(b.size), keeping_factors(1):
             x, outcome = jax.block_until_ready(self._solve(tangent, b))
         self.factorisations += 1
         if int(outcome) == Outcome.OK:
