@@ -51,13 +51,12 @@ class Body:
     """What is measured of one body.
 
     scene : a built-in scene; None for the coarse ventricle of 615 nodes.
-    observe, noise, known : as in an experiment file. sets : the number of data sets.
+    observe, noise, known : as in an experiment file.
     """
 
     scene: str | None
     observe: str
     noise: dict[str, float]
-    sets: int = 10
     known: dict[str, float] = field(default_factory=dict)
 
 
@@ -168,10 +167,12 @@ def draw(cases: list[Case], path: Path) -> None:
 
 
 def main() -> None:
-    arguments = parser(__doc__, HERE).parse_args()
+    words = parser(__doc__, HERE)
+    words.add_argument("--sets", type=int, default=10, help="data sets of each body")
+    arguments = words.parse_args()
     results = Results(arguments.out, SEED, again=arguments.again)
-    for name, body in BODIES.items():
-        for number in range(1 if arguments.quick else body.sets):
+    for number in range(1 if arguments.quick else arguments.sets):
+        for name in BODIES:
             results.case(f"{name} {number}", lambda b=name, n=number: one(b, n))
     cases = results.cases
     summary = conclude(cases)

@@ -201,7 +201,8 @@ def diagnose(
     )
     if wrong_map is not None:
         yield ": ".join(wrong_map)
-    yield from _round_faults(json.loads(attributes.get(ROUNDS_RECORD, "[]")))
+    if ROUNDS_RECORD in attributes:
+        yield from _round_faults(json.loads(attributes[ROUNDS_RECORD]))
     if box:
         yield ": ".join(in_words(box))
     yield from _chain_faults(draws, statistics, summary, wrong_map is None, bool(box))
@@ -218,7 +219,9 @@ def diagnose(
 
 
 def _round_faults(rounds: Sequence[Mapping[str, float]]) -> Iterator[str]:
-    """Yield a sentence where the last round did not foresee FEM."""
+    """Yield a sentence where the last round did not foresee FEM, or there was none."""
+    if not rounds:
+        yield "FEM was not foreseen by any round of runs: there was none; give more time or runs"
     for last in rounds[-1:]:
         missed, worst = last["missed"], last["worst"]
         if not (missed <= FORESEEN and worst <= FORESEEN_ANYWHERE):

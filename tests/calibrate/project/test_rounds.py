@@ -3,8 +3,10 @@
 import json
 from dataclasses import asdict, replace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 from scipy.stats import norm
 
 import calibrate as cal
@@ -28,6 +30,7 @@ from emulator.core.errors import InputError, SolverError
 from emulator.fem.campaign import workers
 from emulator.fem.solution import Status
 from emulator.scenes.built_in import BUILT_IN
+from emulator.surrogates.correction import correction_at
 
 BEAM = "once_clamped_beam"
 # The beam's range is 50 to 100 kPa in both moduli; neither is in it.
@@ -80,6 +83,37 @@ def test_what_was_saved_is_read_again(folder):
     assert set(run.prior["median"]) == {"mu", "lam"}
     space = {p.name: p for p in posterior.model.forward.scene.parameters}
     assert space["mu"].low < 10.0 < 500.0 < space["mu"].high
+
+
+def test_what_is_sampled_is_the_process_that_fem_tested(folder):
+    """Also after it was saved; the displacement of the body, and other data, are the emulator's."""
+    _, posterior = read_posterior(folder)
+    model, draws = posterior.model, posterior.draws()
+    process = model.full.data
+    assert model.question == process.question
+    values = {name: jnp.asarray(v[7]) for name, v in draws.items()}
+    x = model.on_scales(jnp.stack([values[name] for name in model.states.unknowns]))
+    means, valid = model.predict(values)
+    flat = process.constant + correction_at(process.correction, x)
+    assert bool(valid)
+    np.testing.assert_array_equal(ravel_pytree(means)[0], flat)
+    thetas = model.states.thetas(values)
+    by_body = model.observe(model.evaluate(thetas).displacement, thetas)["displacement"]
+    assert 0.0 < np.abs(by_body - means["displacement"]).max() < 0.02  # mm, a tenth of the noise
+    other = cal.model(
+        model.full, cal.nodal_displacements(model.full.scene, [3]), cal.GaussianNoise(1)
+    )
+    u = other.predict(values)[0]["displacement"]
+    np.testing.assert_allclose(u[0], model.full(thetas[0])[3], rtol=1e-12)
+    outside = {name: jnp.asarray(1e6) for name in values}
+    assert not bool(model.predict(outside)[1])
+
+
+def test_a_budget_that_is_over_ends_the_search_and_says_so(monkeypatch):
+    posterior = infer(RUN, check_map=False, deadline=0.0)
+    assert json.loads(posterior.tree.attrs["rounds"]) == []
+    assert len(posterior.taught_at()["mu"]) == 10
+    assert any("FEM was not foreseen" in warning for warning in posterior.warnings())
 
 
 def test_a_search_that_was_killed_goes_on_to_the_same_posterior(folder, tmp_path, monkeypatch):

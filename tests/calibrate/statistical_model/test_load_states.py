@@ -27,6 +27,7 @@ def test_loads_belong_to_a_state_and_the_material_does_not(ventricle):
     assert thetas.shape == (3, 2, 5)
     np.testing.assert_allclose(thetas[:, 0], [[*MATERIAL.values(), 0.6]] * 3)
     np.testing.assert_allclose(thetas[:, 1, 4], [1.1, 1.2, 1.3])
+    np.testing.assert_array_equal(states.values(thetas[1]), [*MATERIAL.values(), 1.2])
     # In one state without a name a parameter keeps its own name.
     assert load_states(ventricle, ("",))[0].unknowns == ventricle.parameter_names
     # A prior under the bare name is each state's.

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from emulator.core.errors import InputError
-from emulator.fem.linear import Outcome, block_pattern, whole_blocks
+from emulator.fem.linear import Outcome, block_pattern, suitesparse, whole_blocks
 from emulator.fem.linear import solve as solving
 from emulator.fem.linear.solve import attempt, solve
 from emulator.fem.linear.suitesparse import (
@@ -23,6 +23,20 @@ from emulator.fem.linear.suitesparse import (
     factor_and_solve,
     register,
 )
+
+
+def test_a_large_factorisation_that_is_alone_has_all_cores(monkeypatch):
+    """And no other: small ones, and those of several threads, have one thread each."""
+    threads = lambda: {library.num_threads for library in suitesparse._blas()}
+    monkeypatch.setattr(suitesparse, "cores", lambda: 2)
+    suitesparse.prepare()
+    with suitesparse.on_all_cores(suitesparse.LARGE):
+        assert threads() == {2}
+    assert threads() == {1}
+    with suitesparse.on_all_cores(suitesparse.LARGE - 1):
+        assert threads() == {1}
+    with suitesparse.keeping_factors(2), suitesparse.on_all_cores(suitesparse.LARGE):
+        assert threads() == {1}
 
 
 def matrix(size=12, shift=4.0, *, symmetric=True, seed=0):
