@@ -245,6 +245,7 @@ SHORT = OWN.replace("order = 2\n", "")
 TIP = np.array([[35.0, 5.0, 5.0], [24.0, 5.0, 5.0]])
 
 
+@pytest.mark.slow
 def test_data_that_refuse_a_coarse_mesh_are_accepted_on_the_finer_one(tmp_path, capsys):
     """Linear elements lock; the remedy that the verdict names is one word more."""
     em.write_mesh(tmp_path / "own.vtu", em.generators.box((40.0, 10.0, 10.0), (4, 1, 2)))
