@@ -2,6 +2,8 @@
 
 import ast
 import re
+import subprocess
+import sys
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -159,3 +161,13 @@ def test_no_module_binds_a_name_twice():
                 inside = [each for target in targets for each in ast.walk(target)]
                 names += [n.id for n in inside if isinstance(n, ast.Name)]
         assert len(names) == len(set(names)), (path.name, {n for n in names if names.count(n) > 1})
+
+
+@pytest.mark.parametrize(
+    "name", ["emulator.generators", "emulator.families", "emulator.laws", "calibrate.priors"]
+)
+def test_a_sub_module_is_there_before_anything_else_is_used(name):
+    package, sub_module = name.split(".")
+    code = f"import {package} as front; print(front.{sub_module}.__name__)"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout.strip().endswith(sub_module)

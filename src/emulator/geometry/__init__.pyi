@@ -1,3 +1,4 @@
+from . import generators as generators
 from .discretisation import quadrature_points
 from .facets import Cavity, enclosed_volume
 from .fibres import wall_depth
