@@ -46,7 +46,8 @@ def test_the_site_builds_without_a_warning(tmp_path):
     assert done.returncode == 0, done.stderr[-2000:]
     page = (tmp_path / "generated" / "calibrate.html").read_text(encoding="utf-8")
     for name in calibrate.__all__:
-        assert f'id="calibrate.{name}"' in page
+        if not inspect.ismodule(getattr(calibrate, name)):
+            assert f'id="calibrate.{name}"' in page, name
 
 
 def test_no_line_of_prose_is_wider_than_100_characters():

@@ -238,4 +238,4 @@ def maximin_subset(
     while len(subset) < min(count, len(positions)) and distance.max() > 0.0:
         subset.append(int(np.argmax(distance)))
         distance = np.minimum(distance, np.sum((positions - positions[subset[-1]]) ** 2, axis=1))
-    return np.array(subset)
+    return np.array(subset, dtype=int)
