@@ -160,8 +160,8 @@ def draw(cases: list[Case], path: Path) -> None:
             )  # fmt: skip
     axes.set(
         yticks=range(len(BODIES)), yticklabels=list(BODIES), xlabel="FEM runs of the rounds",
-        title="filled: a truth outside of the scene's range; red: not accepted",
     )  # fmt: skip
+    figure.suptitle("filled: a truth outside of the scene's range; red: not accepted", fontsize=10)
     figure.savefig(path, dpi=130)
     plt.close(figure)
 

@@ -141,3 +141,9 @@ def test_refusals(simulator, runs, series):
     )
     refused("nothing to fit: the map meets every FEM run", nothing, series)
     refused("a map that is finite at every FEM run", runs, series, lambda x: jnp.nan * series(x))
+
+
+def test_points_that_are_known_are_no_farthest_ones():
+    rows = maximin_subset(np.zeros((3, 2)), 2, np.zeros((1, 2)))
+    assert rows.dtype.kind == "i"
+    assert rows.size == 0
