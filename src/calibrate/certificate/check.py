@@ -29,7 +29,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -49,16 +49,31 @@ from emulator.core.machine import one_blas_thread
 from emulator.fem.solution import EquilibriumSolver
 from emulator.surrogates.correction import Correction
 
-_BEGIN, _AT_MOST = 70, 200  # FEM runs by default
-_BEGIN_TAUGHT = 50  # of a map that FEM runs have taught where the posterior is
-_FEWEST = 25
-# Shares of the runs that train the correction; the others test it.
-_AT_DRAWS, _AROUND, _AT_PRIOR, _DESCENTS, _ADAPTIVE = 0.15, 0.1, 0.1, 0.08, 0.12
+_AT_MOST, _FEWEST = 200, 25  # FEM runs
 _FEWEST_DESCENTS = 16  # runs with which descents reach an end
-_FEWEST_AT_PRIOR = 7
-_ADAPTIVE_TAUGHT = 0.04  # in place of _ADAPTIVE
 _ROUNDS = 5  # rounds of adaptive runs
 _STABILITY = 20  # draws at which the sign of the tangent is examined
+
+
+class _Shares(NamedTuple):
+    """The number of FEM runs to begin with, and what shares of them train; the others test.
+
+    at_draws, around, at_prior : at draws of the posterior, around them, and at draws of the prior.
+    descents : along descents; where those are fewer than 16, ``few_descents``, up to 16.
+    adaptive : where the correction is uncertain.
+    """
+
+    begin: int = 70
+    at_draws: float = 0.15
+    around: float = 0.1
+    at_prior: float = 0.1
+    descents: float = 0.08
+    few_descents: float = 1.0 / 6.0
+    adaptive: float = 0.12
+
+
+# Earlier runs train the correction of a taught map; what they may have missed is sought as before.
+_SHARES, _TAUGHT = _Shares(), _Shares(50, at_prior=0.14, few_descents=0.2, adaptive=0.04)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +106,7 @@ def examine(
     progress: bool = False,
     stages: Stages | None = None,
 ) -> Check:
-    """Check ``posterior`` with FEM runs: 70 or 40, doubled up to 200 while it is undecided.
+    """Check ``posterior`` with FEM runs: 70 or 50, doubled up to 200 while it is undecided.
 
     Parameters
     ----------
@@ -110,9 +125,8 @@ def examine(
         it.
     """
     taught_at = posterior.taught_at()
-    begin = _BEGIN_TAUGHT if taught_at else _BEGIN
-    count, most = _checked_counts(draws, at_most, mesh, begin)
-    fewest = min(_FEWEST_AT_PRIOR, max(count // 7, 4))
+    share = _TAUGHT if taught_at else _SHARES
+    count, most = _checked_counts(draws, at_most, mesh, share.begin)
     stages = Stages(show=False) if stages is None else stages
     predictive = Predictive(posterior.model, posterior.data, posterior.draws())
     rng = np.random.default_rng(seed)
@@ -123,16 +137,18 @@ def examine(
     ):
         solver = FEMRunner(predictive, FEMLikelihood(posterior.model, simulator), bar)
         with stages("FEM where the map was asked"):
-            rows = np.linspace(0, len(z) - 1, max(round(_AT_DRAWS * count), 5)).astype(int)
+            rows = np.linspace(0, len(z) - 1, max(round(share.at_draws * count), 5)).astype(int)
             at_draws = solver(z[rows], stability=_STABILITY, slopes=True)
             # Next to the draws the map may hide a part of the posterior, by an error that draws of
             # the prior are too far apart to show.
-            surroundings = Kernels.surrounding(z, rng).sample(rng, max(round(_AROUND * count), 4))
-            around = solver(surroundings, slopes=True)
-            prior = predictive.prior_draws(key_from(rng), max(round(_AT_PRIOR * count), fewest))
+            surrounding = Kernels.surrounding(z, rng)
+            beside = surrounding.sample(rng, max(round(share.around * count), 4))
+            around = solver(beside, slopes=True)
+            prior = predictive.prior_draws(key_from(rng), max(round(share.at_prior * count), 4))
             at_prior = solver(prior, slopes=True)
             # Only descents of FEM's own misfit lead to a mode that the map hides altogether.
-            descending = max(round(_DESCENTS * count), min(_FEWEST_DESCENTS, count // 5))
+            few = min(_FEWEST_DESCENTS, int(share.few_descents * count))
+            descending = max(round(share.descents * count), few)
             descents, modes = descend(solver, at_prior, at_draws, z, descending, rng)
         training, total = FEMRuns.joined([at_draws, around, at_prior, descents]), count
         known = [FEMRuns.of_map(predictive, predictive.unconstrain(taught_at))] if taught_at else []
@@ -205,8 +221,8 @@ def _train(
         return correction_from(every, predictive, most + len(every.z) - len(runs.z))
 
     pool = Pool.search(predictive, corrected(runs), z, modes, rng)
-    share = _ADAPTIVE_TAUGHT if known else _ADAPTIVE
-    for size in _rounds(max(round(share * count), 1)):
+    adaptive = (_TAUGHT if known else _SHARES).adaptive
+    for size in _rounds(max(round(adaptive * count), 1)):
         chances = tempered(pool.log_explored, MOST_TEMPERED)
         if chances.any():
             points = pool.z[rng.choice(len(pool.z), size=size, p=chances)]
@@ -214,7 +230,7 @@ def _train(
         pool = pool.corrected_by(corrected(runs))
         if effective(normalised(pool.log_explored)) < MOST_TEMPERED:
             pool = pool.stepped(pool.log_explored, rng)
-    return runs, pool.polished(rng).drawn_again(rng)
+    return runs, pool.polished(rng).redrawn(rng)
 
 
 def _rounds(count: int) -> list[int]:

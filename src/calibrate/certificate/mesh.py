@@ -43,12 +43,7 @@ from emulator.fem import Simulator
 from emulator.fem.campaign import in_order
 from emulator.fem.solution import EquilibriumSolver
 from emulator.scenes.scene import Scene
-from emulator.surrogates.correction import (
-    Correction,
-    corrections,
-    fit_correction,
-    no_correction,
-)
+from emulator.surrogates.correction import Correction, corrections, fit_correction, no_correction
 
 MOST_RUNS = 30
 """Default of the largest number of solves on the finer mesh."""
@@ -138,8 +133,8 @@ def mesh_change(
 def _differences_of_fem(predictive: Predictive, finer: FinerFEM, bar: tqdm) -> Differences:
     """Return FEM's differences; each point starts from the finer solutions of earlier ones.
 
-    Where points are solved at once, of the first point, and of earlier calls: never from what
-    another thread may have finished or not.
+    Points that are solved at once start from the first point's, and from those of earlier calls,
+    never from what another thread may or may not have finished.
     """
     known: list[MeshErrorEstimate] = []
 

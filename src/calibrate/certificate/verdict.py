@@ -17,12 +17,7 @@ from calibrate.certificate.evidence import (
     all_within,
 )
 from calibrate.posterior.box import in_words
-from calibrate.posterior.diagnosis import (
-    SMALLEST_P,
-    closer_map,
-    map_fault,
-    sampling_faults,
-)
+from calibrate.posterior.diagnosis import SMALLEST_P, closer_map, map_fault, sampling_faults
 from calibrate.posterior.taken_up import REMEDY
 from emulator.core.display import TableRepr
 

@@ -39,8 +39,6 @@ from calibrate.importance.weights import effective, normalised
 MOST_TEMPERED = 300.0  # effective points that the kernels of the next step are put on, at most
 TEMPERED_SHARE = 0.15  # that number at most, as a share of all points
 STEP = 512  # points of a step
-_FOLLOWING = 2048  # points of the proposal that follows draws
-_SEARCH_ROUNDS = 8
 _RESAMPLED = 1024  # points that a step's kernels are put around
 _FREEDOM = 5.0  # degrees of freedom of the kernels
 _WIDE_WIDTHS, _WIDE_FREEDOM = (1.0, 2.0), 3.0
@@ -239,11 +237,6 @@ class WeightedPoints(ABC):
         """Return the log densities ``at`` points z (s, p)."""
 
     @property
-    @abstractmethod
-    def log_sought(self) -> np.ndarray:
-        """Log weights (s,) of the density to which points move from the prior."""
-
-    @property
     def drawn(self) -> int:
         """Number of points that come from prior and proposals."""
         return self.priors + sum(self.counts)
@@ -265,20 +258,6 @@ class WeightedPoints(ABC):
         centres = Kernels.following(centres, rng).sample(rng, len(centres))
         return self.extended(Kernels.following(centres, rng), STEP, rng)
 
-    def searched(self, rng: np.random.Generator) -> Self:
-        """Return the points with more, by steps from the prior towards what is sought."""
-        points = self
-        for _ in range(_SEARCH_ROUNDS):
-            if effective_number(points.log_sought) >= TEMPERED_SHARE * len(points.z):
-                break
-            points = points.stepped(points.log_sought, rng)
-        return points
-
-    def covering(self, draws: np.ndarray, rng: np.random.Generator) -> Self:
-        """Return the points with more that follow draws z (s, p), and surround them."""
-        points = self.extended(Kernels.following(draws, rng), _FOLLOWING, rng)
-        return points.extended(Kernels.surrounding(draws, rng), STEP, rng)
-
     def extended(self, proposal: Kernels, count: int, rng: np.random.Generator) -> Self:
         """Return the points with ``count`` more from ``proposal``."""
         points = self.with_points(proposal.sample(rng, count))
@@ -290,25 +269,9 @@ class WeightedPoints(ABC):
         )
 
     def continued(self, count: int, rng: np.random.Generator) -> Self:
-        """Return the points with about ``count`` more, from each proposal as its share is."""
-        shares = np.array(self.counts) / sum(self.counts)
-        more = np.maximum(np.round(count * shares), 1.0).astype(int).tolist()
-        fresh = [q.sample(rng, n) for q, n in zip(self.proposals, more, strict=True)]
-        points = self.with_points(np.concatenate(fresh))
-        counts = [n + m for n, m in zip(self.counts, more, strict=True)]
-        return replace(points, counts=tuple(counts))
-
-    def redrawn(self, rng: np.random.Generator, prior: np.ndarray | None = None) -> Self:
-        """Return fresh points, as many from each proposal.
-
-        Proposals were chosen by looking at points; only points drawn after the choice are
-        independent draws of the mixture (Marin, Pudlo and Sedki 2019).
-
-        prior : as many draws (s, p) of the prior as there are; None where there are none.
-        """
-        fresh = [q.sample(rng, n) for q, n in zip(self.proposals, self.counts, strict=True)]
-        z = np.concatenate(fresh if prior is None else [prior, *fresh])
-        return replace(self, z=z, at=self.densities(z), log_kernels=self.log_kernels_at(z))
+        """Return the points with ``count`` more from the last proposal."""
+        points = self.with_points(self.proposals[-1].sample(rng, count))
+        return replace(points, counts=(*self.counts[:-1], self.counts[-1] + count))
 
     def with_points(self, z: np.ndarray) -> Self:
         """Return the points with added ones z (s, p), which do not come from the proposals."""
@@ -358,11 +321,6 @@ class PosteriorPoints(WeightedPoints):
     def log_weights(self) -> np.ndarray:
         """Log weights (s,) of the posterior."""
         return self.log_posterior - self.log_mixture
-
-    @property
-    def log_sought(self) -> np.ndarray:
-        """Log weights (s,) of the posterior, which is sought."""
-        return self.log_weights
 
 
 def effective_number(log_weights: np.ndarray) -> float:

@@ -14,13 +14,7 @@ from calibrate.certificate.reweighting import can_reweight, reweighted
 from calibrate.measurements import missing_values
 from calibrate.posterior import Posterior, sample
 from calibrate.posterior.diagnosis import MAP_ERRORS, MAP_MOVES, ROUNDS_RECORD, SCALED_NOISE
-from calibrate.project.problem import (
-    Problem,
-    build_model,
-    read_problem,
-    simulator_of,
-    with_data,
-)
+from calibrate.project.problem import Problem, build_model, read_problem, simulator_of, with_data
 from calibrate.project.results import (
     CERTIFICATE,
     SAMPLING,
@@ -101,9 +95,8 @@ def infer(
             )
         errors = NOT_ASKED
         # The states of a specimen, which has no mesh, are solved; rounds have tested their map.
-        is_learned = isinstance(problem.scene, Scene) and forward is None
-        is_learned = is_learned and not isinstance(model.full, FEMForward)
-        if check_map and is_learned:
+        is_exact = not isinstance(problem.scene, Scene) or isinstance(model.full, FEMForward)
+        if check_map and forward is None and not is_exact:
             with stages("check of the map"):
                 simulator = cast(Simulator, problem.simulator)
                 errors = map_errors(posterior.model, simulator, posterior.draws(), posterior.data)

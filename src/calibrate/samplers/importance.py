@@ -30,8 +30,7 @@ posterior. While a heavy mode was seen by one of them only, or reached by a few 
 be unseen, and more populations search, up to twelve; what is then still likely to be unseen is
 told. Where not all saw all modes, or where a tail is heavy, each is fitted once more to the
 weighted points of all, and at the modes of all. The Pareto shape of the weights' tail (Vehtari et
-al. 2024) shows whether the proposal covers it; where it does not, more proposals are added where
-weights are large, and fresh points of all are weighted by their mixture.
+al. 2024) shows whether the proposal covers it.
 
 A mode that has no basin to climb from is found by nothing: a spike beside a broad mode, narrower
 than the distance between points of the prior.
@@ -46,7 +45,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from calibrate.importance.proposals import (
-    STEP,
     Group,
     Kernels,
     PosteriorPoints,
@@ -87,8 +85,6 @@ _PATIENCE = 3  # steps after which a population looks for modes by the gradient
 # Attributes of a run: modes that one population alone saw, and the number that none may have seen.
 SEEN_ONCE, UNSEEN = "modes_seen_once", "modes_unseen"
 _FITS, _MOST_FITS = 2, 6
-_MIXED = 3  # steps that are added to a mixture of proposals
-_TRIALS = 3  # mixtures of which the best is taken
 _LIGHT = 0.5  # Pareto shape of the weights of a good fit: their variance is finite
 _CHOSEN = 1024  # points that the kernels of a step are put around
 _FITTED_TO = 4096  # points, resampled, that a proposal is fitted to
@@ -182,30 +178,6 @@ class _Run:
             self.fit(self.points.z, self.points.log_weights)
             if fits >= _FITS and pareto_shape(self.points.log_weights) < _LIGHT:
                 break
-
-    def mix(self) -> None:
-        """Go to fresh points of many proposals: of steps from the prior, and of the last fit.
-
-        One proposal has one covariance in each place. A ridge that is bent more than the transport
-        map follows, or a long tail, needs several, weighted by their mixture.
-        """
-        rng, chances = self._rng, normalised(self.points.log_weights)
-        draws, trials = self.points.z, list[PosteriorPoints]()
-        for _ in range(_TRIALS):  # fresh points show where kernels leave a gap
-            prior = [prior_draws(self._density, key_from(rng), STEP) for _ in range(2)]
-            points = PosteriorPoints(
-                z=prior[0], at=self._heights(prior[0]), priors=STEP, log_densities=self._heights,
-                log_kernels=np.zeros((0, STEP)),
-            )  # fmt: skip
-            some = draws[rng.choice(len(chances), size=_FITTED_TO, p=chances)]
-            points = points.searched(rng).covering(some, rng)
-            for _ in range(_MIXED):
-                points = points.stepped(points.log_weights, rng)
-            trials.append(points.redrawn(rng, prior[1]))
-            light = pareto_shape(trials[-1].log_weights) < LARGEST_PARETO_SHAPE
-            if light and effective_number(trials[-1].log_weights) >= _FOUND:
-                break
-        self.points = max(trials, key=lambda points: effective_number(points.log_weights))
 
     def fit(self, z: np.ndarray, log_weights: np.ndarray) -> None:
         """Go to fresh points from kernels around weighted points z (s, p)."""
@@ -380,8 +352,6 @@ class ImportanceSampling(Sampler):
                     run.modes = modes
                     run.fit(z, log_weights)
                     run.settle()
-                    if not light:
-                        run.mix()
 
                 list(pool.map(fit, runs))
                 draws = in_rounds(draw, options)

@@ -16,6 +16,7 @@ from scipy.special import logsumexp
 
 from calibrate.importance.proposals import (
     STEP,
+    TEMPERED_SHARE,
     Kernels,
     WeightedPoints,
     effective_number,
@@ -68,10 +69,14 @@ class Pool(WeightedPoints):
             z=z, at=at, priors=_PRIOR, log_kernels=np.zeros((0, _PRIOR)),
             predictive=predictive, correction=correction,
         )  # fmt: skip
-        pool = pool.searched(rng)
+        for _ in range(_SEARCH_ROUNDS):
+            if effective_number(pool.log_explored) >= TEMPERED_SHARE * len(pool.z):
+                break
+            pool = pool.stepped(pool.log_explored, rng)
         pool = replace(pool, follower=len(pool.proposals))
         if draws is not None:
-            pool = pool.covering(draws, rng)
+            pool = pool.extended(Kernels.following(draws, rng), _FOLLOWING, rng)
+            pool = pool.extended(Kernels.surrounding(draws, rng), _WIDE, rng)
         for points in modes:
             pool = pool.extended(Kernels.following(points, rng), STEP, rng)
         return pool.polished(rng)
@@ -100,11 +105,6 @@ class Pool(WeightedPoints):
         """
         gap = self.at.corrected - np.max(self.at.corrected[: self.drawn], initial=-1e300)
         return self.at.prior + gap / (1.0 + self.at.variance) - self.log_mixture
-
-    @property
-    def log_sought(self) -> np.ndarray:
-        """Log weights (s,) by which points are sought: :attr:`log_explored`."""
-        return self.log_explored
 
     @property
     def log_chances(self) -> np.ndarray:
@@ -169,9 +169,16 @@ class Pool(WeightedPoints):
         """Return log densities at points z (s, p), under this pool's correction."""
         return self.predictive.evaluate(z, self.correction)
 
-    def drawn_again(self, rng: np.random.Generator) -> Pool:
-        """Return a pool of fresh points, as many from the prior and from each proposal."""
-        return self.redrawn(rng, self.predictive.prior_draws(key_from(rng), self.priors))
+    def redrawn(self, rng: np.random.Generator) -> Pool:
+        """Return a pool of fresh points, as many from each proposal.
+
+        Proposals were chosen by looking at points; only points drawn after the choice are
+        independent draws of the mixture (Marin, Pudlo and Sedki 2019).
+        """
+        prior = self.predictive.prior_draws(key_from(rng), self.priors)
+        fresh = [q.sample(rng, n) for q, n in zip(self.proposals, self.counts, strict=True)]
+        z = np.concatenate([prior, *fresh])
+        return replace(self, z=z, at=self.densities(z), log_kernels=self.log_kernels_at(z))
 
     def corrected_by(self, correction: Correction) -> Pool:
         """Return the pool under another correction."""

@@ -21,9 +21,8 @@ the mean strain is balanced, and strains vary about it. So two stress iterates
 (:mod:`emulator.fem.stress_iterates`) begin with the mean strain measures of each coarse element.
 A Newton step is checked by a second back-substitution
 (:func:`emulator.accuracy.estimate.newton_distance`), and another step follows if what the second
-leaves is much. Where steps do not contract, or what is known is further than 2 % from this
-deformation, the way to it from the nearest known theta is halved, and in the end FEM solves on the
-finer mesh.
+leaves is much. Where steps do not contract, as far from any known deformation, they are tried once
+more after stress iterates, and then FEM solves on the finer mesh.
 """
 
 from __future__ import annotations
@@ -55,11 +54,8 @@ _TOLERANCE = 1e-7  # solves on the finer mesh: far below the meshes' difference
 _LEFT = 0.02  # largest share of the meshes' difference that the last step may leave
 _DIVERGENCE = 0.5  # contraction of a step above which FEM solves instead
 _RIDGE = 1e-4  # of the weights of known solutions, in their mean square
-_NEAR = 0.02  # of a displacement, up to which a combination of others is a start
-_HALVINGS = 3  # of the way from the nearest known theta
-_WHAT = "the error of the mesh"
 _STEPS = 3  # largest number of steps
-_STRESS_STEPS = 2  # stress iterates before them, without a known difference
+_STRESS_STEPS = 2  # stress iterates before them, where they would not contract
 
 Quantity = Callable[[jax.Array, jax.Array], jax.Array]
 
@@ -127,81 +123,51 @@ class MeshError:
             No equilibrium was found on one of the meshes.
         """
         theta = jnp.asarray(theta, dtype=float)
-        coarse = self.simulator.solve(theta, start).require_converged(_WHAT).displacement
+        what = "the error of the mesh"
+        coarse = self.simulator.solve(theta, start).require_converged(what).displacement
+        prolonged = jnp.asarray(self.finer.refinement.carry(coarse))
+        begin = self._combined(coarse, known) if known else prolonged
         # A step solves one set of equations; a scene whose mesh is the loaded shape has two.
         if not self.fine.scene.loaded_by:
-            with on_all_cores(3 * len(self.fine.scene.mesh.nodes)):
-                if (fine := self._by_steps(theta, coarse, known, _HALVINGS)) is not None:
-                    return MeshErrorEstimate(theta, coarse, fine, solved=False)
+            has_stresses = applies(self.fine.scene)
+            with on_all_cores(begin.size):
+                is_near = bool(known) or not has_stresses
+                fine = self._steps(theta, begin, prolonged) if is_near else None
+                if fine is None and has_stresses:
+                    fine = self._steps(theta, self._nearer(theta, begin), prolonged)
+            if fine is not None:
+                return MeshErrorEstimate(theta, coarse, fine, solved=False)
         with self._alone:
-            solution = self.fine.solve(theta, self._combined(coarse, known)[0])
+            solution = self.fine.solve(theta, begin)
             if not solution.converged:  # strains of locked elements may be too rough a start
                 solution = self.fine.solve(theta)
-        fine = solution.require_converged(f"{_WHAT}, on the finer one").displacement
+        fine = solution.require_converged(f"{what}, on the finer one").displacement
         return MeshErrorEstimate(theta, coarse, fine, solved=True)
 
-    def _by_steps(
-        self, theta: jax.Array, coarse: jax.Array, known: Sequence[MeshErrorEstimate], halvings: int
-    ) -> jax.Array | None:
-        """Return the displacement (f, 3) on the finer mesh by steps; None if they do not contract.
+    def _combined(self, coarse: jax.Array, known: Sequence[MeshErrorEstimate]) -> jax.Array:
+        """Return the combination (f, 3) mm of ``known`` solutions that is closest to ``coarse``.
 
-        halvings : the number of times that the way from the nearest known theta may be halved.
+        What is left of ``coarse`` is prolonged.
         """
-        begin, apart = self._combined(coarse, known)
-        prolonged = jnp.asarray(self.finer.refinement.carry(coarse))
-        if not known:
-            begin = self._nearer(theta, begin) if applies(self.fine.scene) else begin
-            return self._steps(theta, begin, prolonged)
-        if apart <= _NEAR:
-            fine = self._steps(theta, begin, prolonged)
-            if fine is not None:
-                return fine
-        if not halvings:
-            return None
-        to_unit, from_unit = self.simulator.scene.to_unit, self.simulator.scene.from_unit
-        x = to_unit(theta)
-        nearest = min(known, key=lambda o: float(jnp.sum((to_unit(o.theta) - x) ** 2)))
-        middle = from_unit(0.5 * (to_unit(nearest.theta) + x))
-        solution = self.simulator.solve(middle, coarse)
-        if not solution.converged:
-            return None
-        u = solution.displacement
-        fine = self._by_steps(middle, u, known, halvings - 1)
-        if fine is None:
-            return None
-        between = MeshErrorEstimate(middle, u, fine, solved=False)
-        return self._by_steps(theta, coarse, [*known, between], halvings - 1)
-
-    def _combined(
-        self, coarse: jax.Array, known: Sequence[MeshErrorEstimate]
-    ) -> tuple[jax.Array, float]:
-        """Return a start (f, 3) mm on the finer mesh, and how far what is known is from it.
-
-        That is the share of the displacement that no combination of known solutions has.
-        """
-        prolong = self.finer.refinement.carry
-        if not known:
-            return jnp.asarray(prolong(coarse)), 1.0
         # In NumPy: JAX would compile a program for each number of them.
         solutions, u = np.stack([np.asarray(o.coarse) for o in known]), np.asarray(coarse)
         weights = _weights(solutions.reshape(len(known), -1), u.ravel())
         on_finer = np.tensordot(weights, np.stack([other.fine for other in known]), 1)
-        rest = u - np.tensordot(weights, solutions, 1)
-        apart = np.linalg.norm(rest) / max(np.linalg.norm(u), np.finfo(float).tiny)
-        return jnp.asarray(on_finer + prolong(rest)), float(apart)
+        left = u - np.tensordot(weights, solutions, 1)
+        return jnp.asarray(on_finer + self.finer.refinement.carry(left))
 
     def forget(self) -> None:
         """Free all factors that are kept: a large mesh's are gigabytes, and would stay."""
         free_factors()
 
-    def _nearer(self, theta: jax.Array, prolonged: jax.Array) -> jax.Array:
-        """Return the displacement (f, 3) mm after stress iterates from the ``prolonged`` one.
+    def _nearer(self, theta: jax.Array, begin: jax.Array) -> jax.Array:
+        """Return the displacement (f, 3) mm after stress iterates from ``begin``.
 
-        The prolonged one itself where a tangent is indefinite.
+        It is ``begin`` itself where a tangent is indefinite.
         """
         system = self.fine.system
         iterates = StressIterates(system, self.fine.options.shrink, theta, jnp.ones(()))
-        state = iterates.begin(prolonged)
+        state = iterates.begin(begin)
         every = state.measures  # (m, q, k); the children of a coarse element follow each other
         points = self.finer.refinement.children * every.shape[1]
         of_parents = every.reshape(-1, points, every.shape[2])
@@ -210,7 +176,7 @@ class MeshError:
         for _ in range(_STRESS_STEPS):
             state = iterates.step(state, jnp.ones(()))
             if not bool(state.definite):
-                return prolonged
+                return begin
         return state.u
 
     @cached_property

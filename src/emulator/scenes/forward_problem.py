@@ -55,7 +55,7 @@ class ForwardProblem(TableRepr):
 
     @property
     def learned_in_box(self) -> bool:
-        """Whether something of it was learned, and holds, in the box of theta only."""
+        """Whether a part of the problem was learned from data inside the box of theta only."""
         return False
 
     @property

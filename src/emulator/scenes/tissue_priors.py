@@ -9,6 +9,7 @@ Ogden (2009), Table 1, to dogs and pigs are then within 2.2 log-sds (a 0.057 to 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 from emulator.scenes.parameter_space import LogNormal
@@ -20,10 +21,6 @@ _HUMAN = (
 _PIG = (
     "left ventricle of a pig in simple shear, Holzapfel & Ogden (2009), Table 1; no published "
     "spread: log-sd 1, of exponents 0.7"
-)
-_FAILING = (
-    "7 human left ventricles in heart failure, {} (doi 10.1007/s10237-016-0865-3); a healthy one "
-    "has {}"
 )
 _FILLED = (
     "24 normal human left ventricles at end-diastole, 0.67 to 1.60 kPa, the range as one log-sd to "
@@ -38,6 +35,21 @@ def _alike(source: str, **medians: float) -> dict[str, LogNormal]:
     }
 
 
+def _failing(mean: float, sd: float, healthy: float, unit: str = "") -> LogNormal:
+    r"""Return the log-normal of this mean and sd between failing hearts, to three digits.
+
+    .. math:: \text{median} = m / \sqrt{1 + s^2 / m^2}, \qquad
+        \text{log-sd}^2 = \ln(1 + s^2 / m^2)
+    """
+    spread = 1.0 + (sd / mean) ** 2
+    source = (
+        f"7 human left ventricles in heart failure, mean {mean:g}, sd {sd:g}{unit} "
+        f"(doi 10.1007/s10237-016-0865-3); a healthy one has {healthy:g}{unit}"
+    )
+    median, log_sd = f"{mean / math.sqrt(spread):.3g}", f"{math.sqrt(math.log(spread)):.2g}"
+    return LogNormal(float(median), float(log_sd), source)
+
+
 _MATRIX = _alike(_HUMAN, a=0.322, b=2.05)
 _MYOCARDIUM = _MATRIX | _alike(_HUMAN, a_f=5.57, b_f=2.11)
 # a and a_f are half the textbook's.
@@ -45,12 +57,11 @@ _RELEASED = _MYOCARDIUM | _alike(_HUMAN, a=0.161, a_f=2.79)
 _ORTHOTROPIC = _alike(
     _PIG, a=0.059, b=8.02, a_f=18.5, b_f=16.0, a_s=2.48, b_s=11.1, a_fs=0.216, b_fs=11.4
 )
-# Of mean m and sd s: the median m / sqrt(1 + s^2/m^2), and the log-sd sqrt(ln(1 + s^2/m^2)).
 _GUCCIONE = {
-    "C": LogNormal(2.61, 0.53, _FAILING.format("mean 3.0, sd 1.7 kPa", "1.7 kPa")),
-    "b_f": LogNormal(21.8, 0.52, _FAILING.format("mean 25, sd 14", 8)),
-    "b_t": LogNormal(7.87, 0.52, _FAILING.format("mean 9, sd 5", 3)),
-    "b_fs": LogNormal(9.66, 0.52, _FAILING.format("mean 11, sd 6", 4)),
+    "C": _failing(3.0, 1.7, 1.7, " kPa"),
+    "b_f": _failing(25.0, 14.0, 8.0),
+    "b_t": _failing(9.0, 5.0, 3.0),
+    "b_fs": _failing(11.0, 6.0, 4.0),
 }
 OF_LAWS: Mapping[str, Mapping[str, LogNormal]] = {
     "holzapfel_ogden": _MYOCARDIUM,

@@ -98,7 +98,7 @@ class Specimen(ForwardProblem):
 
     @property
     def learned_in_box(self) -> bool:
-        """Whether stresses of grips were learned in the box of theta."""
+        """Whether the stresses of grips were learned, from FEM inside the box of theta."""
         return self.grips is not None and self.grips.learned is not None
 
     def __post_init__(self) -> None:

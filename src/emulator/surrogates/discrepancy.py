@@ -228,8 +228,8 @@ def maximin_subset(
 ) -> np.ndarray:
     """Return the rows of at most ``count`` different ``positions`` (c, p).
 
-    From the first on, each next row is the one whose least distance from the chosen, and from those
-    of ``known`` (n, p), is greatest.
+    Rows are chosen one after the other. Each is the farthest from its nearest neighbour among those
+    chosen before and the ``known`` points (n, p).
     """
     subset = list[int]()
     distance = np.full(len(positions), np.inf)

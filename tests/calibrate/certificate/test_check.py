@@ -154,6 +154,10 @@ def test_runs_are_doubled_until_they_decide(beam, fem, data, monkeypatch):
     few = cal.certify(posterior, LinearSimulator(fem), draws=40)
     assert few.verdict == "undecided"
     assert "too few FEM runs" in few.reason
+    over = cal.certify(posterior, LinearSimulator(fem), draws=40, at_most=200, deadline=0.0)
+    assert over.verdict == "undecided"
+    assert over.evidence.physics.runs == 40
+    assert "no time was left" in over.evidence.mesh.why
     more = cal.certify(posterior, LinearSimulator(fem), draws=40, at_most=200)
     assert more.verdict == "accepted"
     assert 40 < more.evidence.physics.runs <= 200

@@ -44,6 +44,20 @@ def test_points_without_weight_are_not_read():
     np.testing.assert_allclose(moments(x, weights), [2.0, 0.0], atol=1e-12)
 
 
+def test_changes_are_of_logarithms_of_theta_and_of_noise_itself(beam):
+    model = linear_model(beam)
+    assert model.on_log_scale.all()
+    predictive = Predictive(model, exact_data(model))
+    columns = np.array([[60.0, 70.0], [90.0, 55.0]])
+    np.testing.assert_allclose(predictive.on_scales(columns), np.log(columns))
+    inferred = cal.model(
+        model.full, cal.nodal_displacements(beam, NODES), cal.GaussianNoise(sd_scale=0.2)
+    )
+    with_noise = np.column_stack([columns, [0.1, 0.3]])
+    on_scales = Predictive(inferred, exact_data(model)).on_scales(with_noise)
+    np.testing.assert_allclose(on_scales, np.column_stack([np.log(columns), [0.1, 0.3]]))
+
+
 def test_nothing_has_no_moments():
     assert np.isnan(moments(np.ones((4, 2)), np.zeros(4))).all()
 

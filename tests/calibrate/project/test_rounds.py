@@ -23,6 +23,7 @@ from calibrate.project import (
     read_problem,
     simulator_of,
 )
+from calibrate.project.rounds import Round, _are_foreseen
 from calibrate.report.charts import traces
 from calibrate.report.page import html_of
 from calibrate.statistical_model.fem_likelihood import FEMLikelihood
@@ -107,6 +108,17 @@ def test_what_is_sampled_is_the_process_that_fem_tested(folder):
     np.testing.assert_allclose(u[0], model.full(thetas[0])[3], rtol=1e-12)
     outside = {name: jnp.asarray(1e6) for name in values}
     assert not bool(model.predict(outside)[1])
+
+
+@pytest.mark.parametrize(
+    ("missed", "worst", "ends"),
+    [(0.05, 0.5, True), (0.05, 1.5, False), (0.2, 0.5, False), (np.inf, 0.0, False)],
+)
+def test_rounds_end_where_draws_and_every_likely_point_were_foreseen_twice(missed, worst, ends):
+    last = Round(34, 0, missed, worst)
+    assert _are_foreseen([Round(18, 0, 1.0, 9.0), Round(26, 0, 0.01, 0.1), last]) is ends
+    assert not _are_foreseen([Round(18, 0, 1.0, 9.0), last])
+    assert not _are_foreseen([last])
 
 
 def test_a_budget_that_is_over_ends_the_search_and_says_so(monkeypatch):

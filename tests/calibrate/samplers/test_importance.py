@@ -14,7 +14,7 @@ from calibrate.importance.weights import normalised
 from calibrate.posterior.diagnosis import diagnose
 from calibrate.samplers import Density, ImportanceOptions, density_of, find_sampler
 from calibrate.samplers.auto import AUTO, NOT_BY_IMPORTANCE, SAMPLED_BY, AutoOptions
-from calibrate.samplers.importance import IMPORTANCE, _Run
+from calibrate.samplers.importance import IMPORTANCE
 from calibrate.samplers.protocol import Context
 from emulator.core.errors import InputError, SolverError
 from emulator.surrogates.fem import fem_forward
@@ -235,26 +235,6 @@ def test_what_cannot_work_is_named():
     assert list(diagnose(draws, {}, row, {"weights_pareto_k": 0.5})) == []
     (sentence,) = diagnose(draws, {}, row, {"weights_pareto_k": 0.9})
     assert sentence.startswith("the weights of importance sampling have a heavy tail")
-
-
-def test_a_mixture_of_proposals_covers_a_ridge_to_its_ends():
-    """A bent ridge of width 0.02 and length 16: evidence and quantiles by quadrature."""
-    of = density(lambda z: -0.5 * ((z[1] - z[0] ** 2 / 8.0) / 0.02) ** 2, 2)
-    run = _Run(of, {}, ImportanceOptions(), [3, 0])
-    run.search()
-    run.mix()
-    assert run.points.priors == 512
-    assert len(run.points.proposals) >= 5
-    z, _ = run.draw(4000)
-    x = np.linspace(-16.0, 16.0, 20_001)
-    weight = np.exp(-0.5 * (x / SD) ** 2 - 0.5 * (x**2 / 8.0 / SD) ** 2)
-    step = x[1] - x[0]
-    evidence = weight.sum() * step * 0.02 * np.sqrt(2.0 * np.pi) / (2.0 * np.pi * SD**2)
-    told = np.logaddexp.reduce(run.points.log_weights) - np.log(len(run.points.z))
-    assert told == pytest.approx(np.log(evidence), abs=0.06)
-    for level in (0.05, 0.5, 0.95):
-        exact = x[np.searchsorted(np.cumsum(weight) / weight.sum(), level)]
-        assert np.mean(z[:, 0] <= exact) == pytest.approx(level, abs=0.04)
 
 
 def test_points_where_the_map_has_no_answer_are_left_out():

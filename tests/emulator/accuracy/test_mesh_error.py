@@ -56,6 +56,17 @@ def test_a_few_steps_find_what_a_solve_on_the_finer_mesh_finds(coarse, error):
         assert wrong < 0.05 * float(told.err_u.max())
 
 
+def test_a_start_is_what_the_finer_mesh_adds_to_a_multiple_of_a_deformation(coarse, error):
+    """Linear in a known solution: 1.2 times its displacement starts at 1.2 times the finer one."""
+    first = error(coarse.centre)
+    begin = error._combined(1.2 * first.coarse, [first])
+    np.testing.assert_allclose(
+        begin, 1.2 * first.fine, rtol=0, atol=3e-4 * float(first.err_u.max())
+    )
+    prolonged = error.finer.refinement.carry(1.2 * first.coarse)
+    assert float(jnp.abs(begin - prolonged).max()) > 0.5 * float(first.err_u.max())
+
+
 @pytest.mark.slow
 def test_effectivity(coarse, error):
     """Beside a mesh so fine that its own error does not count."""

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import lognorm
 
 from calibrate.cli import main
 from emulator.core.errors import InputError
@@ -187,6 +188,14 @@ def test_every_law_has_priors_that_a_scene_takes(tmp_path, law):
         assert of[name].source == prior.source
     positive = {q.name for q in scene.law.quantities if (q.low, q.high) == (0.0, np.inf)}
     assert {name for name, prior in of.items() if prior is not None} == positive - {"kappa"}
+
+
+def test_a_published_mean_and_sd_are_those_of_the_log_normal():
+    """Against SciPy's, to the three digits that are written."""
+    for name, mean, sd in (("C", 3.0, 1.7), ("b_f", 25.0, 14.0), ("b_t", 9.0, 5.0)):
+        prior = OF_LAWS["guccione"][name]
+        exact = lognorm(prior.log_sd, scale=prior.median)
+        assert (exact.mean(), exact.std()) == pytest.approx((mean, sd), rel=0.02)
 
 
 def test_a_refused_draft_leaves_no_file(tmp_path, capsys):

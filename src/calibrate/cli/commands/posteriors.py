@@ -98,7 +98,7 @@ def _add_solves(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--draws",
         type=int,
-        help="FEM runs (default: 70, or 40 after rounds of FEM runs, doubled up to 200 while the "
+        help="FEM runs (default: 70, or 50 after rounds of FEM runs, doubled up to 200 while the "
         "verdict is undecided)",
     )
     parser.add_argument(
