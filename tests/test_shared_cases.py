@@ -86,7 +86,7 @@ def test_a_corner_of_a_guessed_box_is_no_knowledge(cases, tmp_path, capsys):
     assert (code, told["verdict"]) == (1, "not certified")
     said = json.dumps(told)
     assert "a corner of the box ends the posterior" in said
-    assert "calibrate train wider:" in said
+    assert "--forward rounds" in said
     code, told = answer(capsys, "identify", "after", out)
     assert code == 0
     assert {end["name"] for end in told["box_ends"]} >= {"a", "a_f"}

@@ -9,7 +9,7 @@ from typing import Any
 from emulator.core.errors import InputError
 from emulator.scenes.built_in import BUILT_IN
 from emulator.scenes.file import read_scene
-from emulator.scenes.finer import CHANGES, FINER, Finer, finer
+from emulator.scenes.finer import FINER, Finer, finer
 from emulator.scenes.forward_problem import ForwardProblem
 from emulator.scenes.scene import Scene, with_mesh
 
@@ -27,8 +27,7 @@ def find_problem(name: str, root: str | Path | None = None) -> ForwardProblem:
     Parameters
     ----------
     name : a built-in scene, a ``.toml`` file, or ``published:<Model>``; ``finer:`` before any of
-        them is that scene on the next finer mesh of its body, ``wider:`` the scene with ranges of
-        its parameters that are wider by half on each side.
+        them is that scene on the next finer mesh of its body.
     root : folder of the published data, for a published model.
 
     Raises
@@ -37,8 +36,8 @@ def find_problem(name: str, root: str | Path | None = None) -> ForwardProblem:
         No such scene or file.
     """
     word, _, of = name.partition(":")
-    if of and word in CHANGES:
-        return CHANGES[word](find_problem(of, root))
+    if of and word == FINER:
+        return finer(find_scene(of, root)).scene
     if name.startswith(_RELEASED):
         if root is None:
             raise InputError(f"scene '{name}': say where the published data is with --root DIR")
@@ -50,8 +49,7 @@ def find_problem(name: str, root: str | Path | None = None) -> ForwardProblem:
     if name not in BUILT_IN:
         raise InputError(
             f"scene '{name}' is unknown; built in: {', '.join(sorted(BUILT_IN))}; "
-            "or give a .toml file, or published:<Model> with --root DIR; finer:SCENE refines, "
-            "wider:SCENE widens ranges"
+            "or give a .toml file, or published:<Model> with --root DIR; finer:SCENE refines"
         )
     return BUILT_IN[name]()
 
@@ -60,8 +58,8 @@ def scene_from_origin(origin: Mapping[str, Any]) -> Scene:
     """Return the scene that ``origin``, plain JSON, describes; ``Scene.origin`` is one."""
     options = dict(origin)
     name = options.pop("scene", None)
-    if name in CHANGES:
-        return with_mesh(CHANGES[name](scene_from_origin(options["of"])))
+    if name == FINER:
+        return finer(scene_from_origin(options["of"])).scene
     if name == "file":
         return with_mesh(read_scene(options["path"]))
     if isinstance(name, str) and name.startswith(_RELEASED):

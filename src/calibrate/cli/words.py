@@ -150,8 +150,7 @@ def add_scene(parser: ArgumentParser, more: str = "") -> None:
     parser.add_argument(
         "scene",
         metavar="SCENE",
-        help="built-in name, .toml file, or published:<Model>; finer:SCENE refines its mesh, "
-        "wider:SCENE widens its ranges" + more,
+        help="built-in name, .toml file, or published:<Model>; finer:SCENE refines its mesh" + more,
     )
     parser.add_argument("--root", metavar="DIR", help="folder of the published data")
 

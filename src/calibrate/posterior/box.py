@@ -22,11 +22,10 @@ In a wider box the mean would move by
 
 .. math:: \Delta = \frac{M_+ (m_+ - \bar x) + M_- (m_- - \bar x)}{1 + M_+ + M_-}
 
-where :math:`E` is three sd of the draws along :math:`d`, or less where a box that is wider by half
-on each side ends (:func:`~emulator.scenes.finer.wider_within`). Where far fewer draws are at the
-exit than the fit says, as between separate modes and an end, the end is none. The directions are
-the axes and the principal axes of the draws. A posterior that is about as wide as the box along
-:math:`d` is left open by the data; it claims nothing there.
+where :math:`E` is three sd of the draws along :math:`d`, or less where nature ends. Where far
+fewer draws are at the exit than the fit says, as between separate modes and an end, the end is
+none. The directions are the axes and the principal axes of the draws. A posterior that is about as
+wide as the box along :math:`d` is left open by the data; it claims nothing there.
 """
 
 from __future__ import annotations
@@ -41,8 +40,7 @@ from calibrate.state_names import split
 from emulator.core.machine import one_blas_thread
 from emulator.core.minimise import minimise
 from emulator.mechanics.laws.law import Quantity
-from emulator.scenes.finer import wider_within
-from emulator.scenes.parameter_space import Parameter
+from emulator.scenes.parameter_space import AT_LIMIT, Parameter
 
 LARGEST_SHIFT = 0.5  # posterior sd by which a wider box may move a mean: as for a finer mesh
 _NO_LIMITS = Quantity("", low=-np.inf)
@@ -92,11 +90,7 @@ def box_ends(
         return []
     x = np.stack([box[n].to_unit(jnp.ravel(draws[n])) for n in names], axis=1)
     x = np.clip(x, 0.0, 1.0)
-    ranges = [wider_within(box[n], quantities.get(box[n].name, _NO_LIMITS)) for n in names]
-    wide = np.stack(
-        [box[n].to_unit(jnp.array([r.low, r.high])) for n, r in zip(names, ranges, strict=True)]
-    )
-    wider = np.abs(wide - [0.0, 1.0]).T
+    beyond = np.array([_beyond(box[n], quantities.get(box[n].name, _NO_LIMITS)) for n in names]).T
     covariance = np.atleast_2d(np.cov(x, rowvar=False))
     directions = np.vstack([np.eye(len(names)), np.linalg.eigh(covariance)[1].T])
     worst: dict[tuple[int, bool], float] = {}
@@ -104,7 +98,7 @@ def box_ends(
         sd = float(np.sqrt(d @ covariance @ d))
         if not 0.0 < sd < _OPEN * np.sqrt((d**2).sum() / 12.0):
             continue
-        up, down = (_exit(x, direction, wider, _FAR * sd) for direction in (d, -d))
+        up, down = (_exit(x, direction, beyond, _FAR * sd) for direction in (d, -d))
         shift = (up.mass * up.beyond - down.mass * down.beyond) / (1.0 + up.mass + down.mass)
         if abs(shift) <= LARGEST_SHIFT * sd:
             continue
@@ -141,15 +135,33 @@ def in_words(ends: Sequence[BoxEnd]) -> tuple[str, str]:
     return (
         f"{corner} the posterior, not the data: {', '.join(map(str, ends))}; in a wider one means "
         f"would move by {by}",
-        "widen the ranges and train there (calibrate train wider:SCENE), or say that nature ends "
-        f"there (--bounded {names})",
+        "infer without a box (a mesh: --forward rounds), or give a wider range or a prior, or say "
+        f"that nature ends there (--bounded {names})",
     )
 
 
-def _exit(x: np.ndarray, d: np.ndarray, wider: np.ndarray, farthest: float) -> _Exit:
+def _beyond(parameter: Parameter, quantity: Quantity) -> tuple[float, float]:
+    """Return how far below and above its range a parameter's values may be by nature.
+
+    In ranges, on its scale; zero where an end is at such a limit. A range above zero ends there.
+    """
+    low, high = parameter.low, parameter.high
+    least = max(quantity.low, 0.0) if low >= 0.0 else quantity.low
+    near = AT_LIMIT * (high - low)
+    if parameter.scale == "log":
+        span = np.log(high / low)
+        below = float(np.log(low / least) / span) if least > 0.0 else np.inf
+        above = float(np.log(quantity.high / high) / span)
+    else:
+        below = 0.0 if low - least < near else (low - least) / (high - low)
+        above = (quantity.high - high) / (high - low)
+    return below, 0.0 if quantity.high - high < near else above
+
+
+def _exit(x: np.ndarray, d: np.ndarray, beyond: np.ndarray, farthest: float) -> _Exit:
     """Return the mass beyond the box along ``d`` (q,) from positions x (s, q).
 
-    wider : how far each lower and each upper side moves out, (2, q). farthest : how far at most.
+    beyond : how far each lower and each upper side may move out, (2, q). farthest : at most.
     """
     moves = np.abs(d) > 1e-9
     d, x = d[moves], x[:, moves]
@@ -157,7 +169,7 @@ def _exit(x: np.ndarray, d: np.ndarray, wider: np.ndarray, farthest: float) -> _
     gap = np.where(high, 1.0 - x, x) / np.abs(d)
     first = gap.argmin(axis=1)
     t = gap[np.arange(len(x)), first]
-    extent = np.where(high, wider[1, moves], wider[0, moves]) / np.abs(d)
+    extent = np.where(high, beyond[1, moves], beyond[0, moves]) / np.abs(d)
     E = min(float(np.median((gap + extent).min(axis=1) - t)), farthest)
     T = float(np.quantile(t, _NEAR))
     if not (T > 0.0 and E > 0.0):

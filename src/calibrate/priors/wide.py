@@ -9,9 +9,9 @@ from typing import Any, cast
 import numpy as np
 
 from calibrate.priors.population import Population
-from emulator.scenes.finer import wider_within
+from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.forward_problem import ForwardProblem
-from emulator.scenes.parameter_space import LogNormal
+from emulator.scenes.parameter_space import AT_LIMIT, SHORT_OF, LogNormal, Parameter
 
 _LEAST_LOG_SD = float(np.log(2.0))
 _OF_RANGE = "the scene's range, one sd of the logarithm to each side"
@@ -67,5 +67,17 @@ def widened[P: ForwardProblem](scene: P, prior: Population) -> P:
         if (median := prior.median.get(parameter.name)) is not None:
             step = float(np.exp(_WIDTH * prior.log_sd[parameter.name]))
             wide = replace(parameter, low=median / step, high=median * step, scale="log")
-            parameters[k] = wider_within(parameter, scene.quantities[parameter.name], wide)
+            parameters[k] = _off_limits(parameter, scene.quantities[parameter.name], wide)
     return cast(P, replace(cast(Any, scene), parameters=tuple(parameters)))
+
+
+def _off_limits(parameter: Parameter, quantity: Quantity, wide: Parameter) -> Parameter:
+    """Return ``wide`` with a range that keeps off nature's limits; an end at a limit stays."""
+    below, above = parameter.low - quantity.low, quantity.high - parameter.high
+    near = AT_LIMIT * (parameter.high - parameter.low)
+    stays = parameter.scale == "uniform" and below < near
+    return replace(
+        wide,
+        low=parameter.low if stays else max(wide.low, parameter.low - SHORT_OF * below),
+        high=parameter.high if above < near else min(wide.high, parameter.high + SHORT_OF * above),
+    )

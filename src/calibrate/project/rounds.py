@@ -190,7 +190,7 @@ def by_rounds(problem: Problem) -> Problem:
     named = run.forward != EMULATOR.name or run.emulator is not None
     if named or not isinstance(scene, Scene):
         return problem
-    # A scene file may have the name of a shipped one, and finer:NAME and wider:NAME do.
+    # A scene file may have the name of a shipped one, and finer:NAME does.
     if scene.name in shipped() and scene.origin.get("scene") == scene.name:
         return problem
     return read_problem(replace(run, forward=ROUNDS.name), scene=scene)

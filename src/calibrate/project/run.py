@@ -22,7 +22,7 @@ from calibrate.state_names import split
 from calibrate.statistical_model import at_sites
 from emulator.core.errors import InputError
 from emulator.core.schema import read_json_as
-from emulator.scenes.finer import CHANGES
+from emulator.scenes.finer import FINER
 from emulator.surrogates import registry, shipped
 from emulator.surrogates.folders import KINDS
 
@@ -199,8 +199,8 @@ def with_absolute_paths(entries: Mapping[str, Any], folder: Path = Path()) -> di
 
     def scene(word: str) -> str:
         change, _, of = word.partition(":")
-        if of and change in CHANGES:
-            return f"{change}:{scene(of)}"
+        if of and change == FINER:
+            return f"{FINER}:{scene(of)}"
         return path(word) if word.endswith(".toml") else word
 
     def data(word: str | dict[str, str]) -> str | dict[str, str]:

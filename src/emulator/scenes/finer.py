@@ -1,28 +1,19 @@
-"""A scene on the next finer mesh of its body, or with wider ranges of its parameters."""
+"""A scene on the next finer mesh of its body."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, cast
 
 import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.geometry.fibres import across
 from emulator.geometry.refinement import Refinement, refined
-from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.fibre_rules import FibreRule
-from emulator.scenes.forward_problem import ForwardProblem
-from emulator.scenes.parameter_space import Parameter
-from emulator.scenes.scene import Scene, with_mesh
+from emulator.scenes.scene import Scene
 
 FINER = "finer"
 """The name under which the origin of a scene says that its mesh was refined."""
-_AT_LIMIT = 0.02  # share of a range within which its end is at a limit
-_SHORT_OF = 0.999  # share of the way to a limit that a wider range may go
-WIDER = "wider"
-"""The name under which the origin of a scene says that the ranges of its parameters are wider."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,36 +96,3 @@ def _is_made_by(rule: FibreRule, scene: Scene) -> bool:
     except InputError:  # the mesh was replaced and lacks the rule's facet sets
         return False
     return fibres.shape == scene.fibres.shape and np.allclose(fibres, scene.fibres, atol=1e-9)
-
-
-def wider_within(
-    parameter: Parameter, quantity: Quantity, wide: Parameter | None = None
-) -> Parameter:
-    """Return the parameter with a wider range that keeps off the limits of its values by nature.
-
-    An end near such a limit stays.
-
-    wide : the parameter with the range it would have; by default wider by half on each side.
-    """
-    wide, near = wide or parameter.wider(), _AT_LIMIT * (parameter.high - parameter.low)
-    below, above = parameter.low - quantity.low, quantity.high - parameter.high
-    stays = parameter.scale == "uniform" and below < near
-    return replace(
-        wide,
-        low=parameter.low if stays else max(wide.low, parameter.low - _SHORT_OF * below),
-        high=parameter.high if above < near else min(wide.high, parameter.high + _SHORT_OF * above),
-    )
-
-
-def wider[P: ForwardProblem](scene: P) -> P:
-    """Return ``scene`` with every parameter's range wider by half of it on each side."""
-    parameters = tuple(wider_within(p, scene.quantities[p.name]) for p in scene.parameters)
-    origin = {"scene": WIDER, "of": dict(scene.origin)} if scene.origin else {}
-    return cast(P, replace(cast(Any, scene), parameters=parameters, origin=origin))
-
-
-CHANGES: Mapping[str, Callable[[ForwardProblem], ForwardProblem]] = {
-    FINER: lambda scene: finer(with_mesh(scene)).scene,
-    WIDER: wider,
-}
-"""What ``finer:SCENE`` and ``wider:SCENE`` are."""

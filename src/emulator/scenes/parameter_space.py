@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any, Literal
 
@@ -24,7 +24,8 @@ import numpy as np
 from emulator.core.errors import InputError
 
 _LARGEST_LOG_SD = 10.0  # a factor of 20 000 to each side
-_SHORT_OF = 0.999  # share of the way from a median to a limit that a range may go
+AT_LIMIT = 0.02  # share of a range within which its end is at a limit of nature
+SHORT_OF = 0.999  # share of the way to such a limit that a range may go
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ class Parameter:
         below : the limit below which its values stay by nature.
         """
         step = math.exp(prior.log_sd)
-        most = prior.median + _SHORT_OF * (below - prior.median)
+        most = prior.median + SHORT_OF * (below - prior.median)
         return cls(name, unit, prior.median / step, min(prior.median * step, most), "log", prior)
 
     def __post_init__(self) -> None:
@@ -108,18 +109,6 @@ class Parameter:
         """Return the derivative of :meth:`from_unit` at the position of ``value``."""
         span = self.high - self.low
         return value * math.log(self.high / self.low) if self.scale == "log" else 0.0 * value + span
-
-    def wider(self) -> Parameter:
-        """Return the parameter with a range wider by half on each side, on its scale.
-
-        A range above or from zero never reaches beyond zero.
-        """
-        if self.scale == "log":
-            factor = math.sqrt(self.high / self.low)
-            return replace(self, low=self.low / factor, high=self.high * factor)
-        half = 0.5 * (self.high - self.low)
-        least = 0.001 * self.low if self.low >= 0.0 else -math.inf
-        return replace(self, low=max(self.low - half, least), high=self.high + half)
 
     def to_json(self) -> dict[str, Any]:
         """Return the arguments of the constructor but the prior as plain JSON."""

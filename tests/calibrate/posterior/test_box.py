@@ -7,12 +7,8 @@ from scipy.special import erf
 import calibrate as cal
 from calibrate.posterior.box import box_ends, in_words
 from calibrate.posterior.diagnosis import diagnose
-from calibrate.project.run import with_absolute_paths
 from calibrate.project.specimen import draft_specimen
-from emulator.catalogue import find_problem, find_scene, scene_from_origin
 from emulator.core.errors import InputError
-from emulator.mechanics.laws.law import Quantity
-from emulator.scenes.finer import wider_within
 from emulator.scenes.parameter_space import Parameter
 from linear_support import linear_forward
 
@@ -91,7 +87,7 @@ def test_a_corner_is_seen_where_no_side_is():
     words, remedy = in_words(ends)
     assert words.startswith("a corner of the box ends the posterior, not the data: a at 2, b at 2")
     assert "--bounded" in remedy
-    assert "wider:SCENE" in remedy
+    assert "--forward rounds" in remedy
 
 
 def test_a_ridge_across_the_box_is_none_and_a_short_one_is():
@@ -154,18 +150,6 @@ def test_data_that_want_more_than_the_box_are_told(beam, model):
             assert not any("mu" in entry["exponents"] for entry in learned["combinations"])
 
 
-def test_a_wider_scene_has_wider_ranges_and_a_name(tmp_path):
-    scene, wider = find_scene("left_ventricle"), find_scene("wider:left_ventricle")
-    for before, after in zip(scene.parameters, wider.parameters, strict=True):
-        assert 0.0 <= after.low < before.low or after.low == before.low == 0.0
-        assert after.high > before.high
-    assert wider.fingerprint != scene.fingerprint
-    assert scene_from_origin(wider.origin).fingerprint == wider.fingerprint
-    assert with_absolute_paths({"scene": "wider:x.toml"}, tmp_path) == {
-        "scene": f"wider:{tmp_path / 'x.toml'}"
-    }
-
-
 def test_a_cut_posterior_is_not_advised_to_narrow_a_prior():
     rng = RNG(0)
     draws = {"a": rng.normal(size=(4, 100))}
@@ -219,10 +203,3 @@ def test_an_end_at_a_limit_of_nature_ends_no_posterior(tmp_path):
     box = {"dispersion": parameter}
     assert box_ends(draws, box, {"dispersion": quantity}) == []
     assert box_ends(draws, box) != []
-    wider = find_problem(f"wider:{tmp_path / 'x_scene.toml'}")
-    (after,) = (p for p in wider.parameters if p.name == "dispersion")
-    assert (after.low, after.high) == (parameter.low, parameter.high)
-    poisson = Quantity("nu", low=-1.0, high=0.5)
-    assert wider_within(Parameter("nu", "", 0.1, 0.4, "log"), poisson).high == pytest.approx(0.4999)
-    middle = Parameter("k", "", 1.0, 2.0)
-    assert wider_within(middle, Quantity("k")) == middle.wider() == Parameter("k", "", 0.5, 2.5)

@@ -6,7 +6,6 @@ import pytest
 
 import calibrate as cal
 import emulator as em
-from emulator.catalogue import find_problem
 from emulator.core.errors import InputError
 from emulator.core.units import with_unit
 from emulator.scenes.file import read_scene
@@ -148,9 +147,6 @@ def test_what_needs_a_mesh_refuses_a_specimen_in_one_line(tmp_path):
     for name in ("", "finer:"):
         with pytest.raises(InputError, match="is a specimen, which has no mesh"):
             em.find_scene(f"{name}{tmp_path / 'scene.toml'}")
-    wide = find_problem(f"wider:{tmp_path / 'scene.toml'}")
-    assert wide.parameters[0].high > read_scene(tmp_path / "scene.toml").parameters[0].high
-    assert wide.origin["scene"] == "wider"
 
 
 PULLED = {
