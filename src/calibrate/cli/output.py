@@ -79,7 +79,7 @@ def posterior_summary(report: Mapping[str, Any]) -> str:
     lines += in_words(report.get("priors", {}))
     lines.append(
         f"{report['chains']} chains x {report['draws']} draws, {report['divergences']} divergences"
-        f", forward map: {report['forward']}"
+        f", forward map: {report['map']}"
     )
     for last in report.get("rounds", [])[-1:]:
         lines.append(

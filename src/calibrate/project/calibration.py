@@ -24,7 +24,7 @@ from calibrate.project.results import (
     save_results,
     save_reweighted,
 )
-from calibrate.project.rounds import account_of, by_rounds, taught_map
+from calibrate.project.rounds import account_of, by_rounds, keep_for_later, taught_map
 from calibrate.project.run import Run
 from calibrate.project.stated_priors import stated_priors
 from calibrate.provenance import as_attributes
@@ -107,7 +107,7 @@ def infer(
         posterior.tree.attrs.update(as_attributes(attributes))
         if target is not None:
             save_results(target, problem, posterior)
-            target.joinpath(SOLUTIONS).unlink(missing_ok=True)
+            keep_for_later(target / SOLUTIONS, posterior)
     return posterior
 
 
@@ -161,6 +161,7 @@ def report(run: Run, posterior: Posterior, certificate: Certificate | None) -> d
     result: dict[str, Any] = {
         "scene": run.scene,
         "forward": run.forward,
+        "map": posterior.model.full.label,
         "parameters": table,
         "priors": stated_priors(run, posterior.model),
         "divergences": posterior.divergences,

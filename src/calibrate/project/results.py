@@ -1,14 +1,15 @@
 """The folder that a run leaves: how it is written, and read again.
 
-=======================  ===========================================================================
-``run.json``             the :class:`~calibrate.project.run.Run`
-``data.csv``             its data
-``forward.safetensors``  the forward map, where it was fitted for this run
-``error.safetensors``    the systematic errors that the likelihood allows for, if any
-``posterior.nc``         the posterior, as ArviZ reads it
-``certificate.json``     what FEM says of the posterior, once it is certified
-``report.html``          the page, once it is written
-=======================  ===========================================================================
+=========================  =========================================================================
+``run.json``               the :class:`~calibrate.project.run.Run`
+``data.csv``               its data
+``forward.safetensors``    the forward map, where it was fitted for this run
+``error.safetensors``      the systematic errors that the likelihood allows for, if any
+``solutions.safetensors``  FEM's that taught the map; another run into the folder begins with them
+``posterior.nc``           the posterior, as ArviZ reads it
+``certificate.json``       what FEM says of the posterior, once it is certified
+``report.html``            the page, once it is written
+=========================  =========================================================================
 
 ``posterior.nc`` carries the run it was sampled for and the fingerprint of its forward map. A
 certificate speaks about that run and that map, so any difference is refused.
@@ -48,7 +49,7 @@ RUN, DATA, POSTERIOR, CERTIFICATE = "run.json", "data.csv", "posterior.nc", "cer
 FORWARD, ERROR = "forward.safetensors", "error.safetensors"
 REPORT = "report.html"
 SAMPLING = "sampling.safetensors"  # checkpoint of a run that has not ended
-SOLUTIONS = "solutions.safetensors"  # FEM's, of a run whose map is still being taught
+SOLUTIONS = "solutions.safetensors"  # FEM's that teach a map
 POPULATION = "population"  # entry of what members share in run.json and in experiment files
 MEMBERS = "members"  # entry of a population's members in run.json, and folder of their runs
 

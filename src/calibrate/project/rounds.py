@@ -23,6 +23,7 @@ The certificate judges the posterior, by FEM runs of its own.
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -39,6 +40,7 @@ from tqdm import tqdm
 from calibrate.certificate.runs import FEMRunner, FEMRuns, correction_from, least_likely
 from calibrate.importance.proposals import key_from
 from calibrate.importance.weights import normalised
+from calibrate.posterior import Posterior
 from calibrate.posterior.diagnosis import (
     FORESEEN,
     FORESEEN_ANYWHERE,
@@ -60,11 +62,13 @@ from emulator.scenes.scene import Scene, with_mesh
 from emulator.surrogates import registry, shipped
 from emulator.surrogates.discrepancy import maximin_subset
 from emulator.surrogates.emulator import EMULATOR, Emulator
+from emulator.surrogates.part import widened
 from emulator.surrogates.protocol import ForwardMap
 from emulator.surrogates.taught import ROUNDS, DataProcess, TaughtEmulator, no_process, taught
 from emulator.training.mechanics import add_discrepancy
 
 _ARRAYS = ("theta", "displacement", "sensitivities")  # of a file of solutions
+_SCENE, _EARLIER = "of", "draws"  # metadata of that file
 _A_ROUND = 8  # runs of a round; half of them are draws
 _BEGIN = 10  # runs spread over the prior
 _CANDIDATES = 16  # points of which one is taken, where the farthest are
@@ -105,9 +109,10 @@ def teach(
     Parameters
     ----------
     model : the model of the data, of the body at rest in place of a forward map.
-    most : the largest number of runs, each in every load state.
+    most : the largest number of runs, each in every load state, besides those of earlier searches.
     keep : the file of FEM's solutions, from which a killed search goes on: the same points are
-        asked, and those it holds are not solved again. None for none.
+        asked, and those it holds are not solved again. A search that ended there
+        (:func:`keep_for_later`) gives this one all its runs to begin with. None for none.
     deadline : the value of ``time.perf_counter`` by which the last round is to end.
 
     Raises
@@ -115,25 +120,31 @@ def teach(
     SolverError
         FEM fails at most points of the prior.
     """
-    kept = {} if keep is None else _read(keep, simulator.scene.fingerprint)
+    fingerprint = simulator.scene.fingerprint
+    kept, earlier = ({}, {}) if keep is None else _read(keep, fingerprint)
+    model, blank = _before_runs(model, simulator.scene)
+    predictive = Predictive(model, data, _noise_draws(model))
+    rng = np.random.default_rng([seed, 2])
+    if set(model.names) <= earlier.keys():
+        begin = predictive.unconstrain({name: np.asarray(earlier[name]) for name in model.names})
+        most += len(begin)
+    else:
+        begin = _spread_over_prior(predictive, min(_BEGIN, most), rng)
     with (
         one_blas_thread(),
         counting(
             total=most, desc="FEM where the posterior is", disable=not progress, unit="run"
         ) as bar,
     ):
-        model, blank = _before_runs(model, simulator.scene)
-        predictive = Predictive(model, data, _noise_draws(model))
         solver = FEMRunner(predictive, FEMLikelihood(model, simulator, kept=kept), bar)
 
         def ask(z: np.ndarray) -> FEMRuns:
             answers = solver(z, slopes=True)
             if keep is not None:
-                _write(keep, kept, simulator.scene.fingerprint)
+                _write(keep, kept, fingerprint, earlier)
             return answers
 
-        rng = np.random.default_rng([seed, 2])
-        runs, rounds = _in_rounds(predictive, ask, most, deadline, rng, bar)
+        runs, rounds = _in_rounds(predictive, ask, begin, most, deadline, rng, bar)
         bar.close()
         learned = correction_from(runs, predictive, most).of_scaled(*predictive.scale_of_features)
     emulator, record = add_discrepancy(Emulator(simulator.scene), _runs_of(kept))
@@ -147,14 +158,18 @@ def teach(
 def _in_rounds(
     predictive: Predictive,
     ask: Callable[[np.ndarray], FEMRuns],
+    begin: np.ndarray,
     most: int,
     deadline: float,
     rng: np.random.Generator,
     bar: tqdm,
 ) -> tuple[FEMRuns, list[Round]]:
-    """Return all runs, and the rounds, of which the last two foresaw FEM or time or runs ended."""
+    """Return all runs, and the rounds, of which the last two foresaw FEM or time or runs ended.
+
+    begin : the points (k, p) of the runs before the first round.
+    """
     began, rounds = time.perf_counter(), list[Round]()
-    runs = ask(_spread_over_prior(predictive, min(_BEGIN, most), rng))
+    runs = ask(begin)
     _require_half(runs)
 
     def is_late() -> bool:
@@ -300,20 +315,37 @@ def _runs_of(kept: Mapping[bytes, Field]) -> Runs:
     )
 
 
-def _write(path: Path, kept: Mapping[bytes, Field], fingerprint: str) -> None:
-    """Write solutions of the scene of ``fingerprint``."""
+_Draws = Mapping[str, list[float]]  # by the unknown's name
+
+
+def _write(path: Path, kept: Mapping[bytes, Field], fingerprint: str, earlier: _Draws) -> None:
+    """Write solutions of the scene of ``fingerprint``, and the draws of searches that ended."""
     runs = _runs_of(kept)._asdict()
     arrays = {name: np.asarray(runs[name])[::-1] for name in _ARRAYS}
-    save_arrays(path, {n: np.ascontiguousarray(a) for n, a in arrays.items()}, {"of": fingerprint})
+    about = {_SCENE: fingerprint, _EARLIER: json.dumps(earlier)}
+    save_arrays(path, {n: np.ascontiguousarray(a) for n, a in arrays.items()}, about)
 
 
-def _read(path: Path, fingerprint: str) -> dict[bytes, Field]:
-    """Return the solutions that a search of the same scene left; none where there are none."""
+def _read(path: Path, fingerprint: str) -> tuple[dict[bytes, Field], _Draws]:
+    """Return solutions and draws that searches of the same scene left, or none."""
     if not path.is_file():
-        return {}
+        return {}, {}
     arrays, metadata = read_arrays(path)
-    if metadata.get("of") != fingerprint or not set(_ARRAYS) <= set(arrays):
-        return {}
-    thetas, *fields = (arrays[name] for name in _ARRAYS)
+    if metadata.get(_SCENE) != fingerprint or not set(_ARRAYS) <= set(arrays):
+        return {}, {}
+    thetas, *fields = (widened(arrays[name]) for name in _ARRAYS)
     rows = zip(*fields, strict=True)
-    return {theta.tobytes(): Field(*row) for theta, row in zip(thetas, rows, strict=True)}
+    kept = {theta.tobytes(): Field(*row) for theta, row in zip(thetas, rows, strict=True)}
+    return kept, json.loads(metadata[_EARLIER])
+
+
+def keep_for_later(path: Path, posterior: Posterior) -> None:
+    """Say in the file of a search's solutions that it ended, and at which draws FEM was solved.
+
+    Derivatives are kept in single precision. Nothing is done where no search left a file.
+    """
+    if path.is_file() and (taught_at := posterior.taught_at()):
+        arrays, metadata = read_arrays(path)
+        arrays[_ARRAYS[2]] = arrays[_ARRAYS[2]].astype(np.float32)
+        draws = {name: np.asarray(values).tolist() for name, values in taught_at.items()}
+        save_arrays(path, arrays, metadata | {_EARLIER: json.dumps(draws)})

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
 from markupsafe import Markup
@@ -21,6 +25,7 @@ from calibrate.posterior.posterior import describe_distribution
 from calibrate.priors.population import in_words as priors_in_words
 from calibrate.priors.priors import Truncated
 from calibrate.project import Run, holds_population, read_posterior, simulator_of
+from calibrate.project.calibration import SECONDS
 from calibrate.project.members import read_members
 from calibrate.project.results import CERTIFICATE, REPORT
 from calibrate.project.stated_priors import stated_priors
@@ -31,7 +36,9 @@ from emulator.core.errors import InputError
 from emulator.core.store import read_json, replacing
 from emulator.scenes.scene import with_mesh
 from emulator.specimens.specimen import Specimen
+from emulator.surrogates import CachedEmulator
 
+_CALLS = 50  # of a likelihood, timed together
 _SHEET = 0.1  # thickness of a sheet, as a share of its width
 _SHIFTS = {
     "FEM": "by FEM / sd",
@@ -88,6 +95,7 @@ def html_of(
         *body,
         ("What the data determine", [*_known(posterior), *_sheet(posterior), *_terms(posterior)]),
         ("Draws", [parts.chart(figure) for figure in draws]),
+        ("The map from parameters to data", [parts.paragraph(text) for text in _costs(posterior)]),
         ("Where this comes from, and how to repeat it", _provenance(run, posterior)),
     ]
     title = f"{scene.name}: posterior of {', '.join(posterior.model.names)}"
@@ -217,6 +225,35 @@ def _terms(posterior: Posterior) -> list[Markup]:
         tests = parts.table(HeldOut.head, (test.cells for test in terms.held_out))
         blocks += [parts.paragraph(text), tests]
     return blocks
+
+
+def _costs(posterior: Posterior) -> Iterator[str]:
+    """Yield sentences on what the forward map is, and what it cost once and costs for each theta.
+
+    Times are measured where the page is written, after compilation.
+    """
+    model = posterior.model
+    seconds = json.loads(posterior.tree.attrs.get(SECONDS, "{}"))
+    stages = "".join(f"; {stage}: {spent:.1f} s" for stage, spent in seconds.items())
+    yield f"Forward map: {model.full.label}{stages}."
+    if not isinstance(model.full, CachedEmulator):
+        return
+    begin = perf_counter()
+    model.full.emulator.cache()
+    once = perf_counter() - begin
+    density = jax.value_and_grad(model.map_log_likelihood)
+    draw = {name: jnp.asarray(values[0]) for name, values in posterior.draws().items()}
+    program = jax.jit(density).lower(draw, posterior.data).compile()
+    jax.block_until_ready(program(draw, posterior.data))
+    begin = perf_counter()
+    for _ in range(_CALLS):
+        jax.block_until_ready(program(draw, posterior.data))
+    each_call = (perf_counter() - begin) / _CALLS
+    what = "a graph network's processor" if model.full.label == "graph network" else "all modes"
+    yield (
+        f"What depends on the geometry alone, {what}, is computed once, in {once:.2g} s. A log "
+        f"likelihood with its gradient then takes {1e3 * each_call:.2g} ms."
+    )
 
 
 def _provenance(run: Run, posterior: Posterior) -> list[Markup]:

@@ -22,6 +22,9 @@ from emulator.fem.energy import volume_ratio
 from emulator.fem.solution import EquilibriumSolver
 from emulator.scenes.scene import Scene
 
+_KEPT_BITS = 40  # bits of theta that tell solutions apart, relative to its size
+_KEPT_TO = 2.0**_KEPT_BITS
+
 
 class Likelihoods(NamedTuple):
     """Log likelihoods of the data at one draw.
@@ -47,6 +50,12 @@ class Likelihoods(NamedTuple):
     slopes: np.ndarray | None = None
 
 
+def _key(theta: np.ndarray) -> bytes:
+    """Return ``theta`` (p,) to 40 bits, as bytes: equal for one draw, whoever transformed it."""
+    mantissa, exponent = np.frexp(theta)
+    return np.ldexp(np.round(mantissa * _KEPT_TO), exponent - _KEPT_BITS).tobytes()
+
+
 class FEMLikelihood:
     """FEM's log likelihood under ``model``.
 
@@ -55,7 +64,7 @@ class FEMLikelihood:
     model : the statistical model.
     simulator : the simulator of the model's scene, or of its specimen.
     kept : the solutions at which nothing is solved again, with their sensitivities, by the bytes of
-        their theta; those of every solve are added. None to keep none.
+        their theta to 40 bits; those of every solve are added. None to keep none.
 
     :class:`InputError` where the simulator is for another scene.
     """
@@ -121,7 +130,7 @@ class FEMLikelihood:
         """
         thetas = jnp.concatenate([self.model.states.thetas(draw) for draw in draws])
         states, kept = len(self.model.states.states), {} if self.kept is None else self.kept
-        keys = [theta.tobytes() for theta in np.asarray(thetas)]
+        keys = [_key(theta) for theta in np.asarray(thetas)]
         solutions = {
             draw: {
                 s: kept[key] for s, key in enumerate(keys[draw * states :][:states]) if key in kept

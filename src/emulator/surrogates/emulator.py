@@ -174,7 +174,14 @@ class CachedEmulator:
     nodes: np.ndarray
 
     kind = "emulator"
-    label = "emulator"
+
+    @property
+    def label(self) -> str:
+        """``graph network`` where all but an offset is one."""
+        series, parts = self.emulator.taylor, set(self.emulator.parts)
+        if series is not None and series.order == 0:
+            parts.remove("taylor")
+        return "graph network" if parts in ({"network"}, {"family"}) else "emulator"
 
     @property
     def scene(self) -> Scene:

@@ -13,7 +13,7 @@ PARAMETERS = {
     for name in ("pressure@end_diastole", "noise_sd_displacement@end_diastole")
 }  # fmt: skip
 POSTERIOR = {
-    "parameters": PARAMETERS, "chains": 4, "draws": 1000, "divergences": 0, "forward": "emulator",
+    "parameters": PARAMETERS, "chains": 4, "draws": 1000, "divergences": 0, "forward": "emulator", "map": "emulator",
 }  # fmt: skip
 SHIFTS = {"shift": dict.fromkeys(PARAMETERS, -0.0123)}
 

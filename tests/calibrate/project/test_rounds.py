@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict, replace
+from shutil import copytree
 
 import jax.numpy as jnp
 import numpy as np
@@ -149,7 +150,25 @@ def test_a_search_that_was_killed_goes_on_to_the_same_posterior(folder, tmp_path
     _, before = read_posterior(folder)
     assert len(solved) == json.loads(before.tree.attrs["rounds"])[-1]["runs"] - 18
     np.testing.assert_allclose(again.draws()["mu"], before.draws()["mu"], rtol=1e-6)
-    assert not (tmp_path / "r" / "solutions.safetensors").exists()
+
+
+def test_another_noise_begins_with_all_runs_of_the_folder(folder, tmp_path, monkeypatch):
+    copytree(folder, tmp_path / "r")
+    solve, solved = workers.Solver.__call__, []
+    monkeypatch.setattr(
+        workers.Solver, "__call__", lambda solver, task: solved.append(1) or solve(solver, task)
+    )
+    before = json.loads(read_posterior(folder)[1].tree.attrs["rounds"])[-1]["runs"]
+    another = replace(RUN, noise={"displacement": 0.1})
+    posterior = infer(another, tmp_path / "r", check_map=False, force=True)
+    record = json.loads(posterior.tree.attrs["rounds"])
+    assert record[0]["runs"] == before + 8
+    assert len(solved) == record[-1]["runs"] - before
+    assert record[-1]["missed"] < 0.1
+    assert len(posterior.taught_at()["mu"]) == record[-1]["runs"]
+    for name, value in TRUTH.items():
+        row = posterior.summary()[name]
+        assert abs(row["mean"] - value) < 3.0 * row["sd"], name
 
 
 def test_fem_that_fails_in_a_third_of_the_prior_costs_runs_and_nothing_else(monkeypatch):

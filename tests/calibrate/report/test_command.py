@@ -26,6 +26,8 @@ def test_a_law_without_fibres_and_a_body_without_cavity(tmp_path, capsys):
     assert "truth" in text
     assert "not certified" in text
     assert "once_clamped_beam" in text
+    assert "Forward map: graph network; " in text
+    assert "a graph network&#39;s processor, is computed once, in" in text
     assert main(["report", str(tmp_path / "run"), "--out", "page.pdf"]) == 2
     assert "must end in .html" in capsys.readouterr().err
     assert main(["report", str(tmp_path / "none")]) == 2

@@ -18,7 +18,7 @@ from emulator.surrogates.emulator import PARTS
 from emulator.surrogates.network import fresh
 from emulator.surrogates.network.graph import AugmentedGraph
 from emulator.surrogates.polynomial import compressed, degrees_up_to
-from emulator.surrogates.taylor import expand
+from emulator.surrogates.taylor import constant, expand
 from network_support import drawn
 
 SMALL = Architecture(steps=1, latent=8, hidden=(16, 16), decoder="separable", modes=3)
@@ -54,6 +54,16 @@ def only(emulator, names):
 def test_the_parts_are_the_fields(whole):
     assert list(whole.parts) == list(NAMES)
     assert list(only(whole, ("network",)).parts) == ["network"]
+
+
+def test_a_network_is_called_one(whole):
+    assert whole.cache().label == "emulator"
+    network = only(whole, ("network",))
+    assert network.cache().label == "graph network"
+    rest = constant(np.full(2, 0.5), whole.taylor.displacement)
+    assert replace(network, taylor=rest).cache().label == "graph network"
+    assert replace(network, taylor=whole.taylor).cache().label == "emulator"
+    assert em.Emulator(whole.scene).cache().label == "emulator"
 
 
 @pytest.mark.parametrize("names", SUMS, ids="+".join)
