@@ -39,6 +39,7 @@ ROOMS = {
     "serving": ("calibrate.um_bridge", "calibrate.local_server", "calibrate.cli.commands.serving"),
     "analyses": ("calibrate.analysis", "calibrate.cli.commands.analyses"),
     "populations": ("calibrate.population", "calibrate.project.members"),
+    "predictions": ("calibrate.prediction", "calibrate.cli.commands.prediction"),
     "released": (
         "emulator.released",
         "emulator.verify",
@@ -54,6 +55,7 @@ NEIGHBOURS = {
     "released": {"specimens"},
     "serving": {"pages"},
     "populations": {"pages"},
+    "predictions": {"pages", "specimens"},
 }
 """The rooms that a room reaches into."""
 

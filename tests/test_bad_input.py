@@ -18,8 +18,9 @@ from calibrate.cli import COMMANDS as COMMAND_NAMES
 from calibrate.cli import main
 from calibrate.cli.words import seconds
 from calibrate.measurements.data import read_measurements, write_data
-from calibrate.project import Run, make_data
+from calibrate.project import Run
 from cli_support import write_block
+from data_support import make_data
 from emulator.core.errors import InputError
 from emulator.surrogates.folders import SHIPPED
 from emulator.training import recipe

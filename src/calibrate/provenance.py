@@ -1,4 +1,4 @@
-"""Provenance of results: machine, versions of packages."""
+"""Provenance of results: machine, versions of packages, distributions in words."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
+import numpyro.distributions as dist
 
 PACKAGES = (
     "soft-tissue-calibrate",
@@ -55,3 +57,22 @@ def hardware() -> dict[str, Any]:
         "machine": platform.machine(),
         "accelerator": accelerator,
     }
+
+
+def describe_distribution(distribution: dist.Distribution) -> str:
+    """Return a distribution in words, e.g. ``LogUniform(low=50.0, high=100.0)``."""
+    parts = {name: getattr(distribution, name, None) for name in distribution.arg_constraints}
+    base = getattr(distribution, "base_dist", None)
+    # The arguments of a named transform such as LogUniform describe it fully.
+    named = isinstance(distribution, dist.TransformedDistribution) and parts
+    if isinstance(base, dist.Distribution) and not named:
+        parts["base"] = base
+    words = [
+        f"{name}={describe_distribution(v) if isinstance(v, dist.Distribution) else _plain(v)}"
+        for name, v in parts.items()
+    ]
+    return f"{type(distribution).__name__}({', '.join(words)})"
+
+
+def _plain(value: Any) -> str:
+    return repr(np.asarray(value).tolist())

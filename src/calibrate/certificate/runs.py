@@ -135,8 +135,14 @@ class FEMRunner:
         )
 
 
-def correction_from(runs: FEMRuns, predictive: Predictive, rows: int) -> Correction:
-    """Return the correction fitted to ``runs`` and their slopes, padded to ``rows`` points."""
+def correction_from(
+    runs: FEMRuns, predictive: Predictive, rows: int, scales: np.ndarray | None = None
+) -> Correction:
+    """Return the correction fitted to ``runs`` and their slopes, padded to ``rows`` points.
+
+    scales : the size (m,) of errors of the data, where all points count alike; by default the
+        noise's sd, and points that FEM finds likely count.
+    """
     means, valid = predictive.means(runs.z)
     x = predictive.features(runs.z)
     usable = valid & runs.converged
@@ -152,8 +158,9 @@ def correction_from(runs: FEMRuns, predictive: Predictive, rows: int) -> Correct
                 if usable[k]
             ]
         )
-    likely = runs.likely[usable]
-    return fit_correction(x[usable], errors, predictive.scales, rows, likely, slopes=slopes)
+    likely = runs.likely[usable] if scales is None else None
+    scales = predictive.scales if scales is None else scales
+    return fit_correction(x[usable], errors, scales, rows, likely, slopes=slopes)
 
 
 @dataclass(frozen=True, eq=False)

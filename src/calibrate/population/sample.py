@@ -20,8 +20,7 @@ from calibrate.population.density import (
 from calibrate.population.model import PopulationModel, population_model, to_scale
 from calibrate.population.posterior import ALONE, Hierarchy, make_tree, tree_of_alone
 from calibrate.posterior import sample
-from calibrate.posterior.posterior import describe_distribution
-from calibrate.provenance import as_attributes, versions
+from calibrate.provenance import as_attributes, describe_distribution, versions
 from calibrate.samplers import NUTSOptions, check_options
 from calibrate.samplers.nuts import NUTS
 from calibrate.samplers.protocol import Context

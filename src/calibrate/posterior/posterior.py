@@ -8,12 +8,12 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-import numpyro.distributions as dist
 import xarray as xr
 
 from calibrate.arviz import base
@@ -31,7 +31,7 @@ from calibrate.posterior.diagnosis import (
 )
 from calibrate.posterior.reliance import Reliance, reliance_of, rests_on_prior
 from calibrate.posterior.taken_up import TakenUp, sentences, taken_up
-from calibrate.provenance import as_attributes, versions
+from calibrate.provenance import as_attributes, describe_distribution, versions
 from calibrate.samplers import check_options, density_of, find_sampler
 from calibrate.samplers.modes import MISSED_BY, MOST, MOST_BY_FEM, explore, missed_mode
 from calibrate.samplers.protocol import Context
@@ -43,6 +43,7 @@ from emulator.core.display import TableRepr
 from emulator.core.errors import InputError, check_known
 from emulator.core.machine import one_blas_thread
 from emulator.core.store import write_netcdf
+from emulator.scenes.forward_problem import ForwardProblem
 
 # Keep the keys of replicated data and of the search for modes apart from the sampler's.
 _PREDICTIONS, _MODES = 0x9E3779B9, 0x85EBCA6B
@@ -116,6 +117,11 @@ class Posterior(TableRepr):
             thetas = thetas.at[:, scene.parameter_names.index(name)].set(value)
         outputs = predictions.outputs_of(observe, self.model.full)
         return outputs.values(thetas).reshape(-1, *observe.shape)
+
+    def predict_on(self, scene: ForwardProblem, observe: Any, **options: Any) -> Any:
+        """Return predictions of another scene: :func:`calibrate.prediction.predict_on`."""
+        room = import_module("calibrate.prediction")
+        return room.predict_on(self, scene, observe, **options)
 
     def summary(self, probability: float = 0.9) -> Summary:
         """Return mean, sd, equal-tailed interval, R-hat, bulk and tail ESS, by parameter."""
@@ -205,25 +211,6 @@ def provenance(model: Model, seed: int, sampler: str, options: Any) -> dict[str,
         "seed": seed,
         "versions": versions(),
     }
-
-
-def describe_distribution(distribution: dist.Distribution) -> str:
-    """Return a distribution in words, e.g. ``LogUniform(low=50.0, high=100.0)``."""
-    parts = {name: getattr(distribution, name, None) for name in distribution.arg_constraints}
-    base = getattr(distribution, "base_dist", None)
-    # The arguments of a named transform such as LogUniform describe it fully.
-    named = isinstance(distribution, dist.TransformedDistribution) and parts
-    if isinstance(base, dist.Distribution) and not named:
-        parts["base"] = base
-    words = [
-        f"{name}={describe_distribution(v) if isinstance(v, dist.Distribution) else _plain(v)}"
-        for name, v in parts.items()
-    ]
-    return f"{type(distribution).__name__}({', '.join(words)})"
-
-
-def _plain(value: Any) -> str:
-    return repr(np.asarray(value).tolist())
 
 
 @one_blas_thread()

@@ -2,7 +2,6 @@ from .calibration import certify_and_keep, infer, report
 from .problem import (
     Problem,
     by_fem,
-    make_data,
     model_before_data,
     read_problem,
     simulator_of,
@@ -20,7 +19,6 @@ __all__ = [
     "holds_population",
     "infer",
     "load",
-    "make_data",
     "model_before_data",
     "read_posterior",
     "read_problem",

@@ -182,13 +182,6 @@ def with_data(problem: Problem) -> Problem:
     return replace(problem, data=data)
 
 
-def make_data(run: Run, scene: ForwardProblem) -> tuple[Observations, dict[str, np.ndarray]]:
-    """Return the observations and the data of a run, with ``scene`` in place of the run's."""
-    problem = with_data(read_problem(run, scene=scene))
-    assert problem.data is not None
-    return problem.observe, dict(problem.data)
-
-
 def ingredients(run: Run, scene: ForwardProblem, *, progress: bool = False) -> Ingredients:
     """Return the ingredients of the forward map of a run."""
     simulator = simulator_of(scene, run.load_steps)

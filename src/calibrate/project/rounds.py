@@ -31,7 +31,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from scipy.special import chdtri
@@ -50,6 +49,7 @@ from calibrate.posterior.diagnosis import (
 from calibrate.project.problem import Problem, build_model, read_problem
 from calibrate.statistical_model import FEMLikelihood, Model
 from calibrate.statistical_model.density import density_of, in_blocks, prior_draws
+from calibrate.statistical_model.fem_likelihood import runs_of
 from calibrate.statistical_model.pool import Pool
 from calibrate.statistical_model.predictive import Predictive
 from emulator.core.display import counting
@@ -57,7 +57,7 @@ from emulator.core.errors import SolverError
 from emulator.core.machine import one_blas_thread
 from emulator.core.store import read_arrays, save_arrays
 from emulator.fem import Simulator
-from emulator.fem.campaign import Field, Runs
+from emulator.fem.campaign import Field
 from emulator.scenes.scene import Scene, with_mesh
 from emulator.surrogates import registry, shipped
 from emulator.surrogates.discrepancy import maximin_subset
@@ -147,7 +147,7 @@ def teach(
         runs, rounds = _in_rounds(predictive, ask, begin, most, deadline, rng, bar)
         bar.close()
         learned = correction_from(runs, predictive, most).of_scaled(*predictive.scale_of_features)
-    emulator, record = add_discrepancy(Emulator(simulator.scene), _runs_of(kept))
+    emulator, record = add_discrepancy(Emulator(simulator.scene), runs_of(kept))
     at = predictive.constrain(runs.z[runs.converged])
     taught_at = {name: values.tolist() for name, values in at.items()}
     rounds_record = {ROUNDS_RECORD: [asdict(r) for r in rounds], TAUGHT_AT: taught_at}
@@ -304,23 +304,12 @@ def _judged(runs: FEMRuns, answers: FEMRuns, predicted: np.ndarray, drawn: int) 
     return Round(len(every.z), failed, size, float(missed[likely].max(initial=0.0)))
 
 
-def _runs_of(kept: Mapping[bytes, Field]) -> Runs:
-    """Return the solutions, the last first: where there are too many, the first go."""
-    thetas, fields = list(kept)[::-1], list(kept.values())[::-1]
-    return Runs(
-        jnp.asarray([np.frombuffer(theta) for theta in thetas]),
-        jnp.stack([jnp.asarray(field.displacement) for field in fields]),
-        jnp.full(len(fields), jnp.nan),
-        jnp.stack([jnp.asarray(field.sensitivities) for field in fields]),
-    )
-
-
 _Draws = Mapping[str, list[float]]  # by the unknown's name
 
 
 def _write(path: Path, kept: Mapping[bytes, Field], fingerprint: str, earlier: _Draws) -> None:
     """Write solutions of the scene of ``fingerprint``, and the draws of searches that ended."""
-    runs = _runs_of(kept)._asdict()
+    runs = runs_of(kept)._asdict()
     arrays = {name: np.asarray(runs[name])[::-1] for name in _ARRAYS}
     about = {_SCENE: fingerprint, _EARLIER: json.dumps(earlier)}
     save_arrays(path, {n: np.ascontiguousarray(a) for n, a in arrays.items()}, about)

@@ -21,7 +21,6 @@ from calibrate.analysis.terms import HeldOut, find_terms
 from calibrate.certificate.evidence import LARGEST_LOG_SD, LARGEST_MESH_SHIFT, LARGEST_SHIFT
 from calibrate.certificate.verdict import shifts
 from calibrate.posterior import Posterior
-from calibrate.posterior.posterior import describe_distribution
 from calibrate.priors.population import in_words as priors_in_words
 from calibrate.priors.priors import Truncated
 from calibrate.project import Run, holds_population, read_posterior, simulator_of
@@ -29,6 +28,7 @@ from calibrate.project.calibration import SECONDS
 from calibrate.project.members import read_members
 from calibrate.project.results import CERTIFICATE, REPORT
 from calibrate.project.stated_priors import stated_priors
+from calibrate.provenance import describe_distribution
 from calibrate.report import charts, parts, population
 from calibrate.report.body import body_figure
 from calibrate.report.parts import Verdict

@@ -17,7 +17,7 @@ from jax.flatten_util import ravel_pytree
 from calibrate.statistical_model.model import Data, Model
 from emulator.core.errors import InputError
 from emulator.fem import Simulator
-from emulator.fem.campaign import Field, Neighbours, Solver, solve_rows
+from emulator.fem.campaign import Field, Neighbours, Runs, Solver, solve_rows
 from emulator.fem.energy import volume_ratio
 from emulator.fem.solution import EquilibriumSolver
 from emulator.scenes.scene import Scene
@@ -224,3 +224,14 @@ class FEMLikelihood:
         value = self.model.log_likelihood(draw, means, data)
         ratios = [volume_ratio(self.simulator.scene, u) for u in fields]
         return value, means, jnp.min(jnp.stack(ratios))
+
+
+def runs_of(kept: Mapping[bytes, Field]) -> Runs:
+    """Return solutions that were kept, the last first: where there are too many, the first go."""
+    thetas, fields = list(kept)[::-1], list(kept.values())[::-1]
+    return Runs(
+        jnp.asarray([np.frombuffer(theta) for theta in thetas]),
+        jnp.stack([jnp.asarray(field.displacement) for field in fields]),
+        jnp.full(len(fields), jnp.nan),
+        jnp.stack([jnp.asarray(field.sensitivities) for field in fields]),
+    )

@@ -8,7 +8,7 @@ import pytest
 
 import emulator as em
 from calibrate.cli import main
-from calibrate.cli.commands.emulators import prediction_summary
+from calibrate.cli.commands.prediction import prediction_summary
 from calibrate.cli.output import volume_lines
 from emulator.fem.outcome import cavity_volumes
 from emulator.geometry.facets import Cavity

@@ -2,7 +2,7 @@
 
 import pytest
 
-from calibrate.cli.commands.emulators import evaluation_summary
+from calibrate.cli.commands.evaluate import evaluation_summary
 from calibrate.cli.commands.posteriors import comparison_summary
 from calibrate.cli.output import posterior_summary, table
 from calibrate.posterior.comparison import Compared, Comparison

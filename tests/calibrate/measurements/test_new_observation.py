@@ -11,7 +11,8 @@ import calibrate as cal
 from calibrate.measurements import OBSERVATIONS, Scalar, observations_from_json, parse_observation
 from calibrate.measurements.data import read_measurements, write_data
 from calibrate.measurements.labels import labels_of
-from calibrate.project import Run, make_data
+from calibrate.project import Run
+from data_support import make_data
 from emulator.core.errors import InputError
 from linear_support import linear_forward
 

@@ -10,8 +10,8 @@ import pytest
 from scipy import stats
 
 import calibrate as cal
-from calibrate.posterior.posterior import describe_distribution
 from calibrate.priors.priors import Truncated
+from calibrate.provenance import describe_distribution
 from calibrate.statistical_model.prior_range import standardised
 from emulator.core.errors import InputError
 from emulator.surrogates.fem import fem_forward

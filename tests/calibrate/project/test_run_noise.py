@@ -13,7 +13,8 @@ from calibrate.cli.run_words import noise_scale_words, noise_words
 from calibrate.measurements import parse_observation
 from calibrate.measurements.data import write_data
 from calibrate.noise import StudentTNoise
-from calibrate.project import Run, infer, make_data, read_posterior, read_problem, report
+from calibrate.project import Run, infer, read_posterior, read_problem, report
+from data_support import make_data
 from emulator.core import schema
 from emulator.core.errors import InputError
 from emulator.geometry.generators.ellipsoid import HUMAN

@@ -11,8 +11,9 @@ from numpyro.infer.util import log_density
 import calibrate as cal
 from calibrate.measurements import observations, parse_observation, spread_landmarks
 from calibrate.measurements.data import read_measurements, write_data
-from calibrate.project import Run, make_data
+from calibrate.project import Run
 from calibrate.statistical_model.load_states import known_thetas, load_states
+from data_support import make_data
 from emulator.core.errors import InputError
 from linear_support import LinearForward, linear_forward
 

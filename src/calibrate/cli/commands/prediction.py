@@ -1,19 +1,17 @@
-"""``calibrate predict`` and ``evaluate``: an emulator at one theta, and its errors at many."""
+"""``calibrate predict``: an emulator at one theta, or a posterior's draws on another scene."""
 
 from __future__ import annotations
 
 import math
 from argparse import Namespace
-from collections.abc import Mapping
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calibrate.cli import words
 from calibrate.cli.output import table, volume_lines
 from calibrate.cli.words import Answer, command, flag, option
 from emulator.core.errors import InputError
-from emulator.core.store import check_folder, write_json
+from emulator.core.store import check_folder
 
 if TYPE_CHECKING:
     import jax
@@ -21,19 +19,100 @@ if TYPE_CHECKING:
     from emulator.accuracy.estimate import ErrorEstimate
     from emulator.scenes import Scene
 
-_EMULATOR = option("emulator", "EMULATOR", "shipped name or folder")
+_ROWS = 24  # numbers of a prediction that a table shows
+_OF_POSTERIOR = ("observe", "draws", "most_runs", "load_steps", "seed")  # options beside --scene
 
 
 @command(
-    _EMULATOR,
+    option("emulator", "EMULATOR|RUN", "shipped name or folder; with --scene, of calibrate infer"),
     words.THETA,
     flag("--error-bar", "estimate the error from the residual forces"),
-    option("--out", "FILE.vtu", "write displacement, stress and strain"),
-    help="an emulator's displacement, and whether to trust it",
+    option("--scene", "OTHER", "what the draws of RUN predict of this scene or specimen, of the "
+           "same law: another body, load or test; --theta has its loads, pressure@p1=0.5"),
+    option("--observe", "WORDS", "of OTHER, as of infer: volume, landmarks:24, ..."),
+    option("--draws", "N", "of RUN (default 1000)", type=int),
+    option("--most-runs", "N", "FEM runs of OTHER at most (default 96)", type=int),
+    option("--load-steps", "N", "of FEM of OTHER (default 1)", type=int),
+    option("--seed", "N", "of draws and places (default 0)", type=int),
+    option("--out", "FILE.vtu|DIR", "write displacement, stress and strain; with --scene draws, "
+           "bands and the body"),
+    help="an emulator's displacement, or what a posterior predicts of another scene",
     description="Evaluate an emulator at one theta. Exit code 1 says not to trust the result: "
-    "theta outside the box, an inverted element, no equilibrium near the prediction.",
-)
+    "theta outside the box, an inverted element, no equilibrium near the prediction. With --scene, "
+    "push the draws of a posterior through another scene, by FEM at a few of them.",
+    epilog="example: calibrate predict RUN --scene heart.toml --theta pressure@p1=0.5 "
+    "pressure@p2=1 --observe volume --out DIR",
+)  # fmt: skip
 def predict(arguments: Namespace) -> Answer:
+    """Predict at one theta, with the guard's verdict, or at the draws of a posterior."""
+    if arguments.scene is not None:
+        return _on_another_scene(arguments)
+    for name in _OF_POSTERIOR:
+        if getattr(arguments, name) is not None:
+            raise InputError(f"--{name.replace('_', '-')} has no effect without --scene")
+    return _at_one_theta(arguments)
+
+
+def _on_another_scene(arguments: Namespace) -> Answer:
+    """Predict another scene by the draws of a posterior."""
+    from calibrate.measurements import parse_observation
+    from calibrate.prediction import output, predict_on
+    from calibrate.prediction.beyond import reaches
+    from calibrate.project import read_posterior
+    from calibrate.state_names import split
+    from emulator.catalogue import find_problem
+
+    if arguments.error_bar:
+        raise InputError("--error-bar is of an emulator at one theta, without --scene")
+    if arguments.observe is None:
+        raise InputError("--scene: say what to predict with --observe, e.g. --observe volume")
+    folder = None if arguments.out is None else check_folder(arguments.out)
+    _, posterior = read_posterior(arguments.emulator)
+    scene, known = find_problem(arguments.scene), words.assignments(arguments.theta)
+    states = tuple(dict.fromkeys(state for _, state in map(split, known) if state)) or ("",)
+    seed = 0 if arguments.seed is None else arguments.seed
+    observe = parse_observation(scene, arguments.observe, seed, states)
+    options = {
+        name: value
+        for name in ("draws", "most_runs", "load_steps")
+        if (value := getattr(arguments, name)) is not None
+    }
+    progress = not arguments.json
+    predicted = predict_on(
+        posterior, scene, observe, known=known, seed=seed, progress=progress, **options
+    )
+    reach = reaches(posterior, predicted.scene, predicted.forward, observe.states, predicted.thetas)
+    result = output.as_json(predicted, reach)
+    text = bands_summary(result)
+    if folder is not None:
+        result["files"] = output.write(predicted, result, folder)
+        text += f"\nwritten to {folder}: {', '.join(result['files'])}"
+    return Answer(result, text, not predicted.warnings)
+
+
+def bands_summary(result: dict[str, Any]) -> str:
+    """Return :func:`calibrate.prediction.output.as_json` as text."""
+    from calibrate.prediction.beyond import Reach
+
+    keys = ("unit", "mean", "sd", "low", "median", "high")
+    shown = list(result["numbers"].items())
+    rows = [[name, *(row[key] for key in keys)] for name, row in shown[:_ROWS]]
+    lines = [table(("prediction", "unit", "mean", "sd", "5 %", "50 %", "95 %"), rows)]
+    if len(shown) > _ROWS:
+        lines.append(f"and {len(shown) - _ROWS} more numbers")
+    by_source: dict[str, list[str]] = {}
+    for name, source in result["sources"].items():
+        by_source.setdefault(source, []).append(name)
+    lines += [f"{', '.join(names)}: {source}" for source, names in by_source.items()]
+    lines.append(
+        f"{result['draws']} draws, {result['fem_runs']} of them by FEM; others are those of a "
+        f"process, which missed tests by {result['missed_sd']:.2g} sd of the draws"
+    )
+    lines += [str(Reach(**one)) for one in result["beyond"] if one["share"] > 0.0]
+    return "\n".join([*lines, *result["warnings"]])
+
+
+def _at_one_theta(arguments: Namespace) -> Answer:
     """Predict at one theta, with the guard's verdict."""
     import jax
     import numpy as np
@@ -138,54 +217,4 @@ def prediction_summary(result: dict[str, Any]) -> str:
         lines += [f"force of '{n}': error {e:.2g} N" for n, e in error["reactions_n"].items()]
     if not result["trusted"]:
         lines.append(f"not to be trusted: {result['guard']}")
-    return "\n".join(lines)
-
-
-@command(
-    _EMULATOR,
-    option("--against", "DIR|fem", "a published model's folder, or our FEM", required=True),
-    option("--cases", type=int, help="FEM runs when against fem (default 50)"),
-    words.add_forward,
-    option("--out", "DIR", "write evaluation.json and figures"),
-    help="errors of an emulator against FEM",
-)
-def evaluate(arguments: Namespace) -> Answer:
-    """Compare a forward map with stored or fresh FEM solutions."""
-    from calibrate.analysis.evaluation import run_evaluation
-
-    options = words.forward_options(arguments)
-    if arguments.out:
-        from calibrate.figures import pyplot
-
-        check_folder(arguments.out)
-        pyplot()  # a missing plotting package is reported before minutes of FEM
-    evaluated = run_evaluation(
-        **words.parameters(run_evaluation, arguments),
-        forward_options=options,
-        progress=not arguments.json,
-    )
-    report = dict(evaluated.report)
-    text = evaluation_summary(report)
-    if arguments.out:
-        from calibrate.figures.evaluation import draw
-
-        path = Path(arguments.out) / "evaluation.json"
-        write_json(path, evaluated.report)
-        report["files"] = [str(file) for file in (path, *draw(evaluated, arguments.out))]
-        text += f"\nwritten: {', '.join(report['files'])}"
-    return Answer(report, text)
-
-
-def evaluation_summary(report: Mapping[str, Any]) -> str:
-    """Return the table of errors as text."""
-    rows = [
-        (name, *(report[name][q] for q in ("median", "mean", "q97_5", "max")), unit)
-        for name, unit in report["units"].items()
-        if name in report
-    ]
-    title = f"{report['cases']} cases"
-    lines = [table((title, "median", "mean", "97.5 %", "max", "unit"), rows)]
-    lines.append(f"forward map: {report['label']}, reference: {report['reference']}")
-    if report["invalid"]:
-        lines.append(f"{report['invalid']} further cases without a valid prediction")
     return "\n".join(lines)

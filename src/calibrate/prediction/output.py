@@ -1,0 +1,104 @@
+"""A prediction as plain JSON, as files, and as a picture of its bands."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import xarray as xr
+
+from calibrate.figures import BLUE, panels, save, with_unit
+from calibrate.prediction.beyond import Reach
+from calibrate.prediction.predict import Predicted
+from calibrate.state_names import in_state, split
+from emulator.core.store import write_json, write_netcdf
+from emulator.geometry.io import write_vtu
+from emulator.scenes.scene import Scene
+
+_FIELD_DRAWS = 100  # draws of which a field's mean and sd are taken
+PREDICTION = "prediction.nc"
+
+
+def numbers(predicted: Predicted) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the name of each predicted number, and its unit, mean, sd and quantiles."""
+    for name, row in predicted.summary().items():
+        for place in np.ndindex(row["mean"].shape):
+            label = name if row["mean"].size == 1 else f"{name}[{', '.join(map(str, place))}]"
+            yield label, {k: v if k == "unit" else float(v[place]) for k, v in row.items()}
+
+
+def as_json(predicted: Predicted, reach: list[Reach]) -> dict[str, Any]:
+    """Return all but the draws as plain JSON."""
+    return {
+        "scene": predicted.scene.name,
+        "draws": len(predicted.thetas),
+        "sources": dict(predicted.sources),
+        "numbers": dict(numbers(predicted)),
+        "fem_runs": predicted.runs,
+        "failed": predicted.failed,
+        "missed_sd": predicted.missed,
+        "beyond": [asdict(one) for one in reach],
+        "warnings": predicted.warnings,
+    }
+
+
+def write(predicted: Predicted, result: dict[str, Any], folder: Path) -> list[str]:
+    """Write draws, numbers, bands and fields into ``folder``; return the files' names."""
+    folder.mkdir(parents=True, exist_ok=True)
+    arrays = {
+        name: xr.DataArray(
+            values,
+            dims=["draw", *(f"{name}_{k}" for k in range(values.ndim - 1))],
+            attrs={"units": predicted.observe.parts[name].unit},
+        )
+        for name, values in predicted.values.items()
+    }
+    unknowns = {f"draw of {name}": ("draw", values) for name, values in predicted.draws.items()}
+    write_netcdf(folder / PREDICTION, xr.Dataset(arrays | unknowns))
+    write_json(folder / "prediction.json", result)
+    bands(predicted, folder / "bands.png")
+    files = [PREDICTION, "prediction.json", "bands.png"]
+    if isinstance(predicted.scene, Scene):
+        files += [write_fields(predicted, k, folder) for k in range(predicted.thetas.shape[1])]
+    return files
+
+
+def write_fields(predicted: Predicted, state: int, folder: Path) -> str:
+    """Write mean and sd of the displacement of the body in a load state; return the file's name."""
+    scene = predicted.scene
+    assert isinstance(scene, Scene), "a specimen has no mesh"
+    name = predicted.observe.states[state]
+    u = jax.lax.map(predicted.forward, predicted.thetas[:_FIELD_DRAWS, state])
+    data = {"displacement": np.asarray(u.mean(axis=0)), "sd": np.asarray(u.std(axis=0))}
+    file = f"body_{name}.vtu" if name else "body.vtu"
+    write_vtu(folder / file, scene.mesh, point_data=data)
+    return file
+
+
+def bands(predicted: Predicted, path: Path) -> None:
+    """Draw band and median of each observation, over its load states or its numbers."""
+    by_kind: dict[str, list[str]] = {}
+    for name in predicted.values:
+        by_kind.setdefault(split(name)[0], []).append(name)
+    figure, grid = panels(len(by_kind), 2, (4.2, 3.0))
+    summary = predicted.summary()
+    for axes, (kind, names) in zip(np.ravel(grid), by_kind.items(), strict=False):
+        low, median, high = (
+            np.concatenate([np.ravel(summary[name][key]) for name in names])
+            for key in ("low", "median", "high")
+        )
+        x = np.arange(len(median))
+        axes.fill_between(x, low, high, color=BLUE, alpha=0.25, lw=0)
+        axes.plot(x, median, "o-", color=BLUE, ms=3, lw=1.2)
+        if len(names) == len(median):
+            ticks = [in_state("", split(name)[1]).lstrip("@") or kind for name in names]
+            axes.set_xticks(x, ticks)
+        else:
+            axes.set_xlabel("number")
+        axes.set_ylabel(with_unit(kind, predicted.observe.parts[names[0]].unit))
+    figure.suptitle(f"{predicted.scene.name}: 90 % band of {len(predicted.thetas)} draws")
+    save(figure, path)

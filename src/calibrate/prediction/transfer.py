@@ -1,0 +1,125 @@
+"""Draws of a posterior as theta of another scene: which parameter takes its values from where."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import jax.numpy as jnp
+import numpy as np
+
+from calibrate.measurements import Observations
+from calibrate.posterior import Posterior
+from calibrate.state_names import split
+from calibrate.statistical_model.load_states import LoadStates, load_states
+from emulator.core.errors import InputError
+from emulator.mechanics.laws.law import law_identity
+from emulator.scenes.forward_problem import ForwardProblem
+from emulator.scenes.parameter_space import Parameter
+
+_BULK = "kappa"  # the parameter of compressible laws that an incompressible specimen has no use for
+
+
+@dataclass(frozen=True, eq=False)
+class Transfer:
+    """Draws of a posterior as theta of another scene.
+
+    scene : the other scene, its ranges wide enough for all draws.
+    states : the source of each entry of theta in each load state.
+    draws : a value (s,) of each of their unknowns.
+    sources : the source of each parameter's values, in words.
+    """
+
+    scene: ForwardProblem
+    states: LoadStates
+    draws: Mapping[str, np.ndarray]
+    sources: Mapping[str, str]
+
+
+def transfer(
+    posterior: Posterior,
+    scene: ForwardProblem,
+    observe: Observations,
+    known: Mapping[str, float],
+    count: int,
+    rng: np.random.Generator,
+) -> Transfer:
+    """Return ``count`` draws of ``posterior``, all if it has fewer, as theta of ``scene``.
+
+    A parameter of the law has the posterior's draws, or the value that was known there. Another one
+    that ``known`` does not name is drawn from its prior in the scene, or else from its range.
+
+    :class:`InputError` where the laws differ, where the scene holds constant what the posterior
+    infers, or for a known name that is no parameter, or one of the posterior's.
+    """
+    before, inferred = posterior.model.forward.scene, posterior.draws()
+    if law_identity(before.law) != law_identity(scene.law):
+        raise InputError(
+            f"scene '{scene.name}' has law {scene.law.name}, and the posterior is of "
+            f"{before.law.name}: give a scene of the same law"
+        )
+    material = [name for name in before.parameter_names if name in before.law.parameters]
+    for name in material:
+        if name in inferred and name in scene.constants:
+            raise InputError(
+                f"scene '{scene.name}' holds {name} at {scene.constants[name]:g}, and the "
+                "posterior infers it: make it one of the scene's parameters"
+            )
+        if name in inferred and name in known:
+            raise InputError(f"{name} is known as {known[name]:g}, and the posterior infers it")
+    sources = dict.fromkeys(known, "given")
+    fixed = {**before.constants, **_known_there(posterior, before)}
+    if getattr(posterior.model.full, "incompressible", False):
+        fixed.pop(_BULK, None)  # nothing there depends on it
+    values = dict(known)
+    for name in set(scene.parameter_names) & set(scene.law.parameters) - set(inferred):
+        if name in fixed and name not in values:
+            values[name], sources[name] = fixed[name], f"{fixed[name]:g}, as for the posterior"
+    size = len(next(iter(inferred.values())))
+    rows = np.sort(rng.choice(size, size=min(count, size), replace=False))
+    states = load_states(scene, observe.states, None, values)[0]
+    parameters = {parameter.name: parameter for parameter in scene.parameters}
+    draws = dict[str, np.ndarray]()
+    for name in states.unknowns:
+        base = split(name)[0]
+        if name in inferred and base in material:
+            draws[name], sources[base] = inferred[name][rows], "the posterior"
+        else:
+            draws[name], sources[name] = _of_prior(parameters[base], len(rows), rng)
+    wide = _wide_enough(scene, states, draws)
+    return Transfer(wide, states, draws, sources)
+
+
+def _known_there(posterior: Posterior, before: ForwardProblem) -> dict[str, float]:
+    """Return the parameters of the law that the posterior's model knows, with their values."""
+    columns = zip(*posterior.model.states.entries, strict=True)
+    by_name = zip(before.parameter_names, columns, strict=True)
+    return {name: column[0] for name, column in by_name if isinstance(column[0], float)}
+
+
+def _of_prior(parameter: Parameter, count: int, rng: np.random.Generator) -> tuple[np.ndarray, str]:
+    """Return draws (count,) of a parameter's prior, and the prior in words."""
+    if (prior := parameter.prior) is not None:
+        draws = prior.median * np.exp(prior.log_sd * rng.normal(size=count))
+        words = f"median {prior.median:.4g}, log sd {prior.log_sd:.2g}"
+        return draws, f"its prior in the scene, {words}"
+    draws = np.asarray(parameter.from_unit(jnp.asarray(rng.random(count))))
+    return draws, f"its range in the scene, {parameter.low:g} to {parameter.high:g}"
+
+
+def _wide_enough(
+    scene: ForwardProblem, states: LoadStates, draws: Mapping[str, np.ndarray]
+) -> ForwardProblem:
+    """Return ``scene`` with ranges that hold its own and theta of all draws."""
+    thetas = np.asarray(states.thetas(draws)).reshape(-1, len(scene.parameters))
+    parameters = tuple(
+        replace(
+            p,
+            low=min(p.low, float(column.min())),
+            high=max(p.high, float(column.max())),
+            prior=None,
+        )
+        for p, column in zip(scene.parameters, thetas.T, strict=True)
+    )
+    return cast(ForwardProblem, replace(cast(Any, scene), parameters=parameters))

@@ -1,0 +1,198 @@
+"""Draws of a posterior on another scene: against FEM at the draws, and what is refused."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import calibrate as cal
+import emulator as em
+from calibrate.cli import main
+from calibrate.prediction import predict_on
+from calibrate.prediction.beyond import reaches
+from calibrate.samplers.laplace import LaplaceOptions
+from emulator.core.errors import InputError, SolverError
+from emulator.fem.campaign import workers
+from emulator.fem.solution import Status
+from emulator.scenes.parameter_space import LogNormal, Parameter
+from emulator.surrogates.taylor import expand
+
+DRAWS = LaplaceOptions(draws=200, chains=2, starts=2)
+
+
+@pytest.fixture(scope="module")
+def posterior(beam, simulator):
+    """Of both moduli of the beam, from its tip."""
+    forward = em.Emulator(beam, taylor=expand(simulator, order=3)).cache()
+    observe = cal.nodal_displacements(beam, "right")
+    theta = beam.theta(mu=75.0, lam=70.0)
+    u = np.asarray(simulator(theta))[observe.nodes]
+    y = u + 0.3 * np.random.default_rng(0).normal(size=u.shape)
+    model = cal.model(forward, observe, cal.GaussianNoise(sd=0.3))
+    return cal.sample(model, y, sampler="laplace", options=DRAWS, seed=1)
+
+
+@pytest.fixture(scope="module")
+def shorter(beam):
+    """Another body of the same tissue, pulled by a larger gravity in a direction of its own."""
+    del beam
+    scene = em.scenes.once_clamped_beam(cells=(3, 1, 1), order=1)
+    return replace(scene, loads=(em.loads.Gravity(), em.loads.Traction("right", (0.0, 0.1, 0.0))))
+
+
+@pytest.fixture(scope="module")
+def predicted(posterior, shorter):
+    return predict_on(posterior, shorter, cal.nodal_displacements(shorter, "right"), draws=200)
+
+
+def test_what_is_predicted_is_fem_at_the_draws(predicted):
+    values, simulator = predicted.values["displacement"], em.Simulator(predicted.scene)
+    assert predicted.missed <= 0.05
+    assert 18 <= predicted.runs < 60
+    assert predicted.warnings == []
+    assert set(predicted.sources.values()) == {"the posterior"}
+    nodes, sd = predicted.observe.nodes, values.std(axis=0).max()
+    for k in range(0, 200, 23):
+        exact = np.asarray(simulator(predicted.thetas[k, 0]))[nodes]
+        np.testing.assert_allclose(values[k], exact, atol=0.15 * sd)
+        whole = np.asarray(predicted.forward(predicted.thetas[k, 0]))
+        np.testing.assert_allclose(whole[nodes], exact, atol=0.15 * sd)
+
+
+def test_a_summary_is_of_the_values(predicted):
+    row, values = predicted.summary()["displacement"], predicted.values["displacement"]
+    np.testing.assert_allclose(row["mean"], values.mean(axis=0))
+    assert (row["low"] <= row["median"]).all()
+    assert (row["median"] <= row["high"]).all()
+    inside = (values >= row["low"]) & (values <= row["high"])
+    assert inside.mean() == pytest.approx(0.9, abs=0.02)
+
+
+def test_what_the_posterior_lacks_has_its_own_prior(posterior, shorter):
+    """A pressure that is given, and one that is drawn; each is named."""
+    observe = cal.nodal_displacements(shorter, "right")
+    loaded = replace(
+        shorter,
+        parameters=(*shorter.parameters, Parameter("pull", "kPa", 0.05, 0.2)),
+        loads=(em.loads.Gravity(), em.loads.DeadPressure("right", parameter="pull")),
+    )
+    given = predict_on(posterior, loaded, observe, known={"pull": 0.1}, draws=60)
+    assert given.sources["pull"] == "given"
+    assert set(np.asarray(given.thetas)[:, 0, 2]) == {0.1}
+    ranged = predict_on(posterior, loaded, observe, draws=60)
+    assert ranged.sources["pull"] == "its range in the scene, 0.05 to 0.2"
+    assert 0.05 < ranged.draws["pull"].min() < ranged.draws["pull"].max() < 0.2
+    prior = LogNormal(0.1, 0.3, "a guess")
+    stated = replace(loaded.parameters[2], prior=prior)
+    drawn = predict_on(
+        posterior, replace(loaded, parameters=(*loaded.parameters[:2], stated)), observe, draws=60
+    )
+    assert "median 0.1, log sd 0.3" in drawn.sources["pull"]
+    assert np.log(drawn.draws["pull"]).std() == pytest.approx(0.3, rel=0.3)
+
+
+def test_bad_uses_are_refused_in_a_line(posterior, shorter):
+    observe = cal.nodal_displacements(shorter, "right")
+    other_law = replace(shorter, law=em.find_law("small_strain"))
+    held = replace(shorter, parameters=shorter.parameters[:1], constants={"lam": 70.0})
+    cases = (
+        (other_law, {}, "give a scene of the same law"),
+        (held, {}, "holds lam at 70, and the posterior infers it"),
+        (shorter, {"known": {"mu": 60.0}}, "mu is known as 60, and the posterior infers it"),
+        (shorter, {"known": {"pressure": 1.0}}, "has no parameter 'pressure'"),
+        (shorter, {"draws": 5}, "5 draws; give 20 or more"),
+    )
+    for scene, options, words in cases:
+        with pytest.raises(InputError, match=words) as caught:
+            posterior.predict_on(scene, observe, **options)
+        assert "\n" not in str(caught.value)
+
+
+def test_fem_that_fails_is_named(posterior, shorter, monkeypatch):
+    solve = workers.Solver.__call__
+
+    def failing(solver, task):
+        row = solve(solver, task)
+        lost = row.solution._replace(status=np.asarray(int(Status.ITERATION_LIMIT)))
+        return row._replace(solution=lost)
+
+    monkeypatch.setattr(workers.Solver, "__call__", failing)
+    with pytest.raises(SolverError, match="FEM fails at 12 of 12 draws"):
+        predict_on(posterior, shorter, cal.nodal_displacements(shorter, "right"), draws=60)
+
+
+def test_a_larger_load_reaches_beyond_the_data(posterior, beam, predicted):
+    """The body of the data itself does not; one that is pulled further does."""
+    own = reaches(posterior, beam, posterior.model.full, ("",), posterior.thetas()[:, None])
+    assert {one.measure for one in own} == {"I1"}
+    assert all(one.share == 0.0 for one in own)
+    pulled = replace(beam, loads=(em.loads.Traction("right", (0.0, 0.0, -4.0)),))
+    forward = em.Simulator(pulled)
+    (far,) = reaches(posterior, pulled, forward, ("p1",), posterior.thetas()[:4, None])
+    assert far.share > 0.2
+    assert far.reached[1] > far.learned[1]
+    assert "% of the body lies beyond" in str(far)
+    assert far.learned[0] <= 3.0
+
+
+TABLE = "stretch_x,stress_x [kPa]\n" + "".join(
+    f"{x},{30.0 * (x - x**-2):.4f}\n" for x in (1.0, 1.05, 1.1, 1.15, 1.2)
+)
+PIECE = """
+law = "neo_hookean"
+specimen = "t.csv"
+grips = "none"
+parameters = {mu = {unit = "kPa", median = 20, log_sd = 0.7}}
+constants = {lam = 1e5}
+"""
+BODY = """
+mesh = "own.vtu"
+law = "neo_hookean"
+loads = [{kind = "gravity"}]
+supports = [{node_set = "left"}]
+parameters = {mu = {unit = "kPa", range = [5, 100]}}
+constants = {lam = 60}
+"""
+
+
+def test_from_a_specimen_to_a_body_and_to_another_test_by_command(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "t.csv").write_text(TABLE)
+    (tmp_path / "piece.toml").write_text(PIECE)
+    (tmp_path / "body.toml").write_text(BODY)
+    (tmp_path / "further.toml").write_text(PIECE.replace("t.csv", "u.csv"))
+    (tmp_path / "u.csv").write_text("stretch_x,stress_x [kPa]\n1.0,0\n1.5,1\n")
+    em.write_mesh(tmp_path / "own.vtu", em.generators.box((40.0, 10.0, 10.0), (4, 1, 1)))
+    words = ["--data", "t.csv", "--noise", "0.5", "--sampler", "laplace", "--draws", "100"]
+    words += ["--forward", "incompressible", "--no-certify", "--out", "r", "--json"]
+    assert main(["infer", "piece.toml", *words]) == 0
+    mu = json.loads(capsys.readouterr().out)["parameters"]["mu"]
+    assert abs(mu["mean"] - 30.0) < 3.0 * mu["sd"]
+    ask = ["predict", "r", "--scene"]
+    assert main([*ask, "further.toml", "--observe", "stress:stress_x", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    row = list(told["numbers"].values())[1]
+    assert row["mean"] == pytest.approx(mu["mean"] * (1.5 - 1.5**-2), rel=1e-3)
+    assert row["sd"] == pytest.approx(mu["sd"] * (1.5 - 1.5**-2), rel=0.1)
+    (beyond,) = told["beyond"]
+    assert beyond["share"] == 0.5
+    words = ["--observe", "nodes:4", "--draws", "60", "--out", "p"]
+    assert main([*ask, "body.toml", *words]) == 0
+    out = capsys.readouterr().out
+    assert "mu: the posterior" in out
+    for name in ("prediction.nc", "prediction.json", "bands.png", "body.vtu"):
+        assert (tmp_path / "p" / name).stat().st_size > 0
+    refused = (
+        ([*ask, "body.toml"], "say what to predict with --observe"),
+        ([*ask, "body.toml", "--observe", "volume"], "0 cavities"),
+        (["predict", "r", "--draws", "9"], "--draws has no effect without --scene"),
+        ([*ask, "none.toml", "--observe", "nodes:4"], "none.toml"),
+        (["predict", "q", "--scene", "body.toml", "--observe", "nodes:4"], "q"),
+        ([*ask, "body.toml", "--observe", "nodes:4", "--theta", "mu=3"], "the posterior infers it"),
+    )
+    for line, words in refused:
+        assert main(line) == 2
+        complaint = capsys.readouterr().err
+        assert words in complaint
+        assert complaint.count("\n") == 1
