@@ -55,7 +55,7 @@ NEIGHBOURS = {
     "released": {"specimens"},
     "serving": {"pages"},
     "populations": {"pages"},
-    "predictions": {"pages", "specimens"},
+    "predictions": {"pages", "populations", "specimens"},
 }
 """The rooms that a room reaches into."""
 

@@ -2,8 +2,8 @@ r"""How far a prediction goes beyond the data, by the law's own measures.
 
 A law of exponentials is known where tissue was stretched, and guessed beyond. The measures are
 :math:`I_1 = \operatorname{tr} F^T F` and, of a law with fibres, :math:`I_{4f} = |F f|^2`. Their
-ranges over the bodies that the posterior's data are of, in every load state at the posterior's
-mean and at rest, are compared with the body that is predicted, at its mean draw.
+ranges over the bodies that it was learned on, in every load state at the posterior's mean and at
+rest, are compared with the body that is predicted, at its mean draw.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibrate.posterior import Posterior
+from calibrate.prediction.transfer import Learned
 from calibrate.state_names import in_state
 from emulator.fem.fields import element_fields
 from emulator.scenes.forward_problem import ForwardProblem
@@ -53,7 +53,7 @@ class Reach:
 
 
 def reaches(
-    posterior: Posterior,
+    learned: Learned,
     scene: ForwardProblem,
     forward: ForwardMap,
     states: tuple[str, ...],
@@ -63,16 +63,15 @@ def reaches(
 
     forward : a map of the whole body. thetas : theta (s, S, p) of all draws.
     """
-    model = posterior.model
-    means = {name: values.mean() for name, values in posterior.draws().items()}
-    learned: dict[str, list[np.ndarray]] = {}
-    for theta in model.states.thetas(means):
-        for name, (values, _) in _measures(model.full, model.forward.scene, theta).items():
-            learned.setdefault(name, [np.array([_AT_REST[name]])]).append(values)
+    there: dict[str, list[np.ndarray]] = {}
+    for body, thetas_there in learned.bodies:
+        for theta in thetas_there:
+            for name, (values, _) in _measures(body, body.scene, theta).items():
+                there.setdefault(name, [np.array([_AT_REST[name]])]).append(values)
     accounts = []
     for state, theta in zip(states, jnp.mean(thetas, axis=0), strict=True):
         for name, (values, weights) in _measures(forward, scene, theta).items():
-            low, high = (f(np.concatenate(learned[name])) for f in (np.min, np.max))
+            low, high = (f(np.concatenate(there[name])) for f in (np.min, np.max))
             slack = _SLACK * (high - low)
             outside = (values < low - slack) | (values > high + slack)
             share = float(weights[outside].sum() / weights.sum())

@@ -22,7 +22,7 @@ from calibrate.certificate.runs import FEMRunner, FEMRuns, correction_from
 from calibrate.measurements import Observation, Observations, observations
 from calibrate.noise import GaussianNoise
 from calibrate.posterior import Posterior
-from calibrate.prediction.transfer import Transfer, transfer
+from calibrate.prediction.transfer import Learned, Transfer, transfer
 from calibrate.statistical_model import FEMLikelihood, Model
 from calibrate.statistical_model.fem_likelihood import runs_of
 from calibrate.statistical_model.model import model
@@ -89,7 +89,7 @@ class Predicted:
 
 
 def predict_on(
-    posterior: Posterior,
+    learned: Posterior | Learned,
     scene: ForwardProblem,
     observe: Observation | Mapping[str, Observation] | Observations,
     *,
@@ -100,10 +100,11 @@ def predict_on(
     seed: int = 0,
     progress: bool = False,
 ) -> Predicted:
-    """Return what ``posterior`` predicts of another scene of the same law.
+    """Return what draws of a posterior predict of another scene of the same law.
 
     Parameters
     ----------
+    learned : the posterior, or what a population says of a member that was not seen.
     scene : the scene or specimen, whose parameters of the law take the posterior's draws.
     observe : one observation of it, or several by name; ``volume@p8`` is one in a load state.
     known : the values of parameters that are neither the posterior's nor drawn, by
@@ -120,7 +121,9 @@ def predict_on(
     if draws < _FEWEST:
         raise InputError(f"prediction: {draws} draws; give {_FEWEST} or more")
     rng, several = np.random.default_rng([seed, 5]), observations(observe)
-    target = transfer(posterior, scene, several, known or {}, draws, rng)
+    if isinstance(learned, Posterior):
+        learned = Learned.of(learned)
+    target = transfer(learned, scene, several, known or {}, draws, rng)
     thetas = target.states.thetas(target.draws)
     if not isinstance(target.scene, Scene):
         return _of_states(target, several, thetas)

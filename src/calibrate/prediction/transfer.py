@@ -2,23 +2,70 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, cast
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from calibrate.measurements import Observations
 from calibrate.posterior import Posterior
+from calibrate.project import read_posterior
+from calibrate.project.results import MEMBERS
 from calibrate.state_names import split
 from calibrate.statistical_model.load_states import LoadStates, load_states
 from emulator.core.errors import InputError
 from emulator.mechanics.laws.law import law_identity
 from emulator.scenes.forward_problem import ForwardProblem
 from emulator.scenes.parameter_space import Parameter
+from emulator.surrogates.protocol import ForwardMap
 
 _BULK = "kappa"  # the parameter of compressible laws that an incompressible specimen has no use for
+
+
+@dataclass(frozen=True, eq=False)
+class Learned:
+    """Draws of a tissue's parameters, and the bodies that they were learned on.
+
+    scene : one of the bodies. draws : draws (s,) of what was inferred, by name.
+    known : the parameters of the law that were not inferred, with their values.
+    bodies : the forward map of each body, and theta (S, p) of its load states at the mean.
+    """
+
+    scene: ForwardProblem
+    draws: Mapping[str, np.ndarray]
+    known: Mapping[str, float]
+    bodies: Sequence[tuple[ForwardMap, jax.Array]]
+
+    @classmethod
+    def of(cls, posterior: Posterior) -> Learned:
+        """Return what one body's posterior has learned."""
+        model, draws = posterior.model, posterior.draws()
+        scene = model.forward.scene
+        columns = zip(*model.states.entries, strict=True)
+        entries = zip(scene.parameter_names, columns, strict=True)
+        known = {name: column[0] for name, column in entries if isinstance(column[0], float)}
+        known = {**scene.constants, **known}
+        if getattr(model.full, "incompressible", False):
+            known.pop(_BULK, None)  # nothing there depends on it
+        means = {name: values.mean() for name, values in draws.items()}
+        return cls(scene, draws, known, [(model.full, model.states.thetas(means))])
+
+    @classmethod
+    def of_population(cls, folder: str | Path) -> Learned:
+        """Return what a population in ``folder`` says of a member that was not seen."""
+        from calibrate.project.members import read_members  # a room
+
+        plan, hierarchy = read_members(folder)
+        members = [
+            cls.of(read_posterior(Path(folder) / MEMBERS / name)[1]) for name in plan.members
+        ]
+        first = members[0]
+        bodies = [body for member in members for body in member.bodies]
+        return cls(first.scene, hierarchy.new_member(), first.known, bodies)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,14 +85,14 @@ class Transfer:
 
 
 def transfer(
-    posterior: Posterior,
+    learned: Learned,
     scene: ForwardProblem,
     observe: Observations,
     known: Mapping[str, float],
     count: int,
     rng: np.random.Generator,
 ) -> Transfer:
-    """Return ``count`` draws of ``posterior``, all if it has fewer, as theta of ``scene``.
+    """Return ``count`` draws of what was learned, all if there are fewer, as theta of ``scene``.
 
     A parameter of the law has the posterior's draws, or the value that was known there. Another one
     that ``known`` does not name is drawn from its prior in the scene, or else from its range.
@@ -53,7 +100,7 @@ def transfer(
     :class:`InputError` where the laws differ, where the scene holds constant what the posterior
     infers, or for a known name that is no parameter, or one of the posterior's.
     """
-    before, inferred = posterior.model.forward.scene, posterior.draws()
+    before, inferred = learned.scene, learned.draws
     if law_identity(before.law) != law_identity(scene.law):
         raise InputError(
             f"scene '{scene.name}' has law {scene.law.name}, and the posterior is of "
@@ -69,10 +116,7 @@ def transfer(
         if name in inferred and name in known:
             raise InputError(f"{name} is known as {known[name]:g}, and the posterior infers it")
     sources = dict.fromkeys(known, "given")
-    fixed = {**before.constants, **_known_there(posterior, before)}
-    if getattr(posterior.model.full, "incompressible", False):
-        fixed.pop(_BULK, None)  # nothing there depends on it
-    values = dict(known)
+    fixed, values = learned.known, dict(known)
     for name in set(scene.parameter_names) & set(scene.law.parameters) - set(inferred):
         if name in fixed and name not in values:
             values[name], sources[name] = fixed[name], f"{fixed[name]:g}, as for the posterior"
@@ -89,13 +133,6 @@ def transfer(
             draws[name], sources[name] = _of_prior(parameters[base], len(rows), rng)
     wide = _wide_enough(scene, states, draws)
     return Transfer(wide, states, draws, sources)
-
-
-def _known_there(posterior: Posterior, before: ForwardProblem) -> dict[str, float]:
-    """Return the parameters of the law that the posterior's model knows, with their values."""
-    columns = zip(*posterior.model.states.entries, strict=True)
-    by_name = zip(before.parameter_names, columns, strict=True)
-    return {name: column[0] for name, column in by_name if isinstance(column[0], float)}
 
 
 def _of_prior(parameter: Parameter, count: int, rng: np.random.Generator) -> tuple[np.ndarray, str]:

@@ -9,7 +9,7 @@ import pytest
 import calibrate as cal
 import emulator as em
 from calibrate.cli import main
-from calibrate.prediction import predict_on
+from calibrate.prediction import Learned, predict_on
 from calibrate.prediction.beyond import reaches
 from calibrate.samplers.laplace import LaplaceOptions
 from emulator.core.errors import InputError, SolverError
@@ -122,14 +122,15 @@ def test_fem_that_fails_is_named(posterior, shorter, monkeypatch):
         predict_on(posterior, shorter, cal.nodal_displacements(shorter, "right"), draws=60)
 
 
-def test_a_larger_load_reaches_beyond_the_data(posterior, beam, predicted):
+def test_a_larger_load_reaches_beyond_the_data(posterior, beam):
     """The body of the data itself does not; one that is pulled further does."""
-    own = reaches(posterior, beam, posterior.model.full, ("",), posterior.thetas()[:, None])
+    learned = Learned.of(posterior)
+    own = reaches(learned, beam, posterior.model.full, ("",), posterior.thetas()[:, None])
     assert {one.measure for one in own} == {"I1"}
     assert all(one.share == 0.0 for one in own)
     pulled = replace(beam, loads=(em.loads.Traction("right", (0.0, 0.0, -4.0)),))
     forward = em.Simulator(pulled)
-    (far,) = reaches(posterior, pulled, forward, ("p1",), posterior.thetas()[:4, None])
+    (far,) = reaches(learned, pulled, forward, ("p1",), posterior.thetas()[:4, None])
     assert far.share > 0.2
     assert far.reached[1] > far.learned[1]
     assert "% of the body lies beyond" in str(far)

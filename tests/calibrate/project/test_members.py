@@ -56,6 +56,16 @@ def folder(tmp_path_factory):
     return made
 
 
+SHORT = """
+mesh = "short.vtu"
+law = "neo_hookean"
+loads = [{kind = "gravity"}]
+supports = [{node_set = "left"}]
+parameters = {mu = {unit = "kPa", range = [20, 200]}}
+constants = {lam = 70}
+"""
+
+
 class Killed(Exception):
     """Stands for the end of a process."""
 
@@ -215,6 +225,21 @@ def test_the_chart_shows_members_and_one_not_seen(result):
     np.testing.assert_allclose([ends[:, 0] for ends in together], np.stack([low, high], axis=1))
     np.testing.assert_allclose(dots[1].get_xdata(), median)
     assert all(a[0, 1] < b[0, 1] for a, b in zip(alone, together, strict=True))
+
+
+def test_a_member_not_seen_predicts_another_body(result, tmp_path, capsys):
+    """A shorter beam of the population's tissue, under its own weight."""
+    em.write_mesh(tmp_path / "short.vtu", em.generators.box((40.0, 10.0, 10.0), (4, 1, 1)))
+    (tmp_path / "short.toml").write_text(SHORT)
+    words = ["--scene", str(tmp_path / "short.toml"), "--observe", "nodes:4", "--draws", "60"]
+    assert main(["predict", str(result), *words, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["sources"] == {"mu": "the posterior"}
+    assert told["missed_sd"] < 0.05
+    new = cal.population.read_hierarchy(result / "posterior.nc").new_member()["mu"]
+    tip = max(told["numbers"].values(), key=lambda row: abs(row["mean"]))
+    # A tip's deflection goes as one over the stiffness.
+    assert tip["sd"] / abs(tip["mean"]) == pytest.approx(np.std(1.0 / new) * new.mean(), rel=0.4)
 
 
 def test_members_are_not_one_run(folder):

@@ -58,7 +58,8 @@ def _on_another_scene(arguments: Namespace) -> Answer:
     from calibrate.measurements import parse_observation
     from calibrate.prediction import output, predict_on
     from calibrate.prediction.beyond import reaches
-    from calibrate.project import read_posterior
+    from calibrate.prediction.transfer import Learned
+    from calibrate.project import holds_population, read_posterior
     from calibrate.state_names import split
     from emulator.catalogue import find_problem
 
@@ -67,7 +68,11 @@ def _on_another_scene(arguments: Namespace) -> Answer:
     if arguments.observe is None:
         raise InputError("--scene: say what to predict with --observe, e.g. --observe volume")
     folder = None if arguments.out is None else check_folder(arguments.out)
-    _, posterior = read_posterior(arguments.emulator)
+    run = arguments.emulator
+    if holds_population(run):
+        learned = Learned.of_population(run)
+    else:
+        learned = Learned.of(read_posterior(run)[1])
     scene, known = find_problem(arguments.scene), words.assignments(arguments.theta)
     states = tuple(dict.fromkeys(state for _, state in map(split, known) if state)) or ("",)
     seed = 0 if arguments.seed is None else arguments.seed
@@ -79,9 +84,9 @@ def _on_another_scene(arguments: Namespace) -> Answer:
     }
     progress = not arguments.json
     predicted = predict_on(
-        posterior, scene, observe, known=known, seed=seed, progress=progress, **options
+        learned, scene, observe, known=known, seed=seed, progress=progress, **options
     )
-    reach = reaches(posterior, predicted.scene, predicted.forward, observe.states, predicted.thetas)
+    reach = reaches(learned, predicted.scene, predicted.forward, observe.states, predicted.thetas)
     result = output.as_json(predicted, reach)
     text = bands_summary(result)
     if folder is not None:
