@@ -55,6 +55,7 @@ from calibrate.statistical_model.predictive import Predictive
 from emulator.core.display import counting
 from emulator.core.errors import SolverError
 from emulator.core.machine import one_blas_thread
+from emulator.core.rooms import offered
 from emulator.core.store import read_arrays, save_arrays
 from emulator.fem import Simulator
 from emulator.fem.campaign import Field
@@ -199,12 +200,14 @@ def _before_runs(model: Model, scene: Scene) -> tuple[Model, DataProcess]:
 def by_rounds(problem: Problem) -> Problem:
     """Return the problem with a map that is taught where its scene has no emulator.
 
-    A run that names a forward map or an emulator is returned as it is.
+    A specimen gets its states. A run that names a forward map or an emulator is returned as it is.
     """
     run, scene = problem.run, problem.scene
-    named = run.forward != EMULATOR.name or run.emulator is not None
-    if named or not isinstance(scene, Scene):
+    if run.forward != EMULATOR.name or run.emulator is not None:
         return problem
+    if not isinstance(scene, Scene):
+        (of_states,) = offered("emulator.specimens.homogeneous", "INCOMPRESSIBLE")
+        return read_problem(replace(run, forward=of_states.name), scene=scene)
     # A scene file may have the name of a shipped one, and finer:NAME does.
     if scene.name in shipped() and scene.origin.get("scene") == scene.name:
         return problem
