@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +19,7 @@ from calibrate.prediction.transfer import Learned
 from calibrate.state_names import in_state
 from emulator.fem.fields import element_fields
 from emulator.scenes.forward_problem import ForwardProblem
-from emulator.scenes.scene import Scene
+from emulator.scenes.scene import Scene, with_mesh
 from emulator.specimens.specimen import Specimen
 from emulator.surrogates.protocol import ForwardMap
 
@@ -71,6 +70,8 @@ def reaches(
     accounts = []
     for state, theta in zip(states, jnp.mean(thetas, axis=0), strict=True):
         for name, (values, weights) in _measures(forward, scene, theta).items():
+            if name not in there:
+                continue
             low, high = (f(np.concatenate(there[name])) for f in (np.min, np.max))
             slack = _SLACK * (high - low)
             outside = (values < low - slack) | (values > high + slack)
@@ -83,7 +84,12 @@ def reaches(
 def _measures(
     forward: ForwardMap, scene: ForwardProblem, theta: jax.Array
 ) -> Mapping[str, tuple[np.ndarray, np.ndarray]]:
-    """Return values (k,) and weights (k,) of each measure, over elements or a specimen's states."""
+    """Return values (k,) and weights (k,) of each measure, over elements or a specimen's states.
+
+    There are none of a mesh that is the loaded shape: its displacement is not from rest.
+    """
+    if isinstance(scene, Scene) and scene.loaded_by:
+        return {}
     u = forward(theta)
     if isinstance(scene, Specimen):
         F = np.asarray(scene.gradients(u)) + np.eye(3)
@@ -93,7 +99,7 @@ def _measures(
             along = np.einsum("kij,kj->ki", F, np.asarray(fibres).reshape(len(F), 3))
             values["I4f"] = np.einsum("ki,ki->k", along, along)
     else:
-        body = cast(Scene, scene)
+        body = with_mesh(scene)
         fields = element_fields(body, u, theta)
         weights = np.asarray(body.discretisation.weights).sum(axis=1)
         values = {"I1": 3.0 + 2.0 * np.einsum("kii->k", fields["green_lagrange"])}

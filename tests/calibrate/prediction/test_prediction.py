@@ -182,12 +182,14 @@ def test_from_a_specimen_to_a_body_and_to_another_test_by_command(tmp_path, caps
     assert main([*ask, "body.toml", *words]) == 0
     out = capsys.readouterr().out
     assert "mu: the posterior" in out
+    assert "verdict on the posterior: not certified" in out
     for name in ("prediction.nc", "prediction.json", "bands.png", "body.vtu"):
         assert (tmp_path / "p" / name).stat().st_size > 0
     refused = (
         ([*ask, "body.toml"], "say what to predict with --observe"),
         ([*ask, "body.toml", "--observe", "volume"], "0 cavities"),
         (["predict", "r", "--draws", "9"], "--draws has no effect without --scene"),
+        (["predict", "r"], "r is a folder of infer: name the scene that it predicts, --scene"),
         ([*ask, "none.toml", "--observe", "nodes:4"], "none.toml"),
         (["predict", "q", "--scene", "body.toml", "--observe", "nodes:4"], "q"),
         ([*ask, "body.toml", "--observe", "nodes:4", "--theta", "mu=3"], "the posterior infers it"),

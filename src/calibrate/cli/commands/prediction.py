@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from argparse import Namespace
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calibrate.cli import words
 from calibrate.cli.output import table, volume_lines
 from calibrate.cli.words import Answer, command, flag, option
 from emulator.core.errors import InputError
-from emulator.core.store import check_folder
+from emulator.core.store import check_folder, read_json
 
 if TYPE_CHECKING:
     import jax
@@ -50,6 +51,10 @@ def predict(arguments: Namespace) -> Answer:
     for name in _OF_POSTERIOR:
         if getattr(arguments, name) is not None:
             raise InputError(f"--{name.replace('_', '-')} has no effect without --scene")
+    if (Path(arguments.emulator) / "run.json").is_file():
+        raise InputError(
+            f"{arguments.emulator} is a folder of infer: name the scene that it predicts, --scene"
+        )
     return _at_one_theta(arguments)
 
 
@@ -60,6 +65,8 @@ def _on_another_scene(arguments: Namespace) -> Answer:
     from calibrate.prediction.beyond import reaches
     from calibrate.prediction.transfer import Learned
     from calibrate.project import holds_population, read_posterior
+    from calibrate.project.calibration import NOT_CERTIFIED
+    from calibrate.project.results import CERTIFICATE
     from calibrate.state_names import split
     from emulator.catalogue import find_problem
 
@@ -68,11 +75,13 @@ def _on_another_scene(arguments: Namespace) -> Answer:
     if arguments.observe is None:
         raise InputError("--scene: say what to predict with --observe, e.g. --observe volume")
     folder = None if arguments.out is None else check_folder(arguments.out)
-    run = arguments.emulator
+    run, verdict = Path(arguments.emulator), "of members, see calibrate report"
     if holds_population(run):
         learned = Learned.of_population(run)
     else:
         learned = Learned.of(read_posterior(run)[1])
+        file = run / CERTIFICATE
+        verdict = read_json(file)["verdict"] if file.is_file() else NOT_CERTIFIED
     scene, known = find_problem(arguments.scene), words.assignments(arguments.theta)
     states = tuple(dict.fromkeys(state for _, state in map(split, known) if state)) or ("",)
     seed = 0 if arguments.seed is None else arguments.seed
@@ -87,7 +96,7 @@ def _on_another_scene(arguments: Namespace) -> Answer:
         learned, scene, observe, known=known, seed=seed, progress=progress, **options
     )
     reach = reaches(learned, predicted.scene, predicted.forward, observe.states, predicted.thetas)
-    result = output.as_json(predicted, reach)
+    result = {"posterior": verdict, **output.as_json(predicted, reach)}
     text = bands_summary(result)
     if folder is not None:
         result["files"] = output.write(predicted, result, folder)
@@ -109,6 +118,7 @@ def bands_summary(result: dict[str, Any]) -> str:
     for name, source in result["sources"].items():
         by_source.setdefault(source, []).append(name)
     lines += [f"{', '.join(names)}: {source}" for source, names in by_source.items()]
+    lines.append(f"verdict on the posterior: {result['posterior']}")
     lines.append(
         f"{result['draws']} draws, {result['fem_runs']} of them by FEM; others are those of a "
         f"process, which missed tests by {result['missed_sd']:.2g} sd of the draws"
