@@ -92,6 +92,7 @@ _FRESH = 2048  # points at a time from a fitted proposal
 _WORTH = 2.0  # independent draws that the points are worth, for one that is resampled from them
 _CENTRES, _WIDTHS, _FREEDOM = 512, (0.5, 1.0), 5.0  # of a fitted proposal
 _NARROW = (0.25, 0.5)  # of a step's: wide kernels in many dimensions undo its contraction
+_WIDE = 0.25  # share of the kernels of a fit around points of the density's fourth root
 _ON_THE_WAY, _IN_A_FIT = 0.5, 0.25  # share of the kernels that are put beside modes
 _AT_MODE = 1.2  # width of the wider kernels at a mode, over its sd
 _FEWEST_CENTRES = 8  # kernels at a mode
@@ -175,16 +176,22 @@ class _Run:
     def settle(self) -> None:
         """Fit the proposal to the points until their weights have a light tail."""
         for fits in range(1, _MOST_FITS + 1):
-            self.fit(self.points.z, self.points.log_weights)
+            self.fit(self.points.z, self.points.log_weights, self.points.log_posterior)
             if fits >= _FITS and pareto_shape(self.points.log_weights) < _LIGHT:
                 break
 
-    def fit(self, z: np.ndarray, log_weights: np.ndarray) -> None:
-        """Go to fresh points from kernels around weighted points z (s, p)."""
+    def fit(self, z: np.ndarray, log_weights: np.ndarray, log_posterior: np.ndarray) -> None:
+        """Go to fresh points from kernels around weighted points z (s, p).
+
+        A quarter of the kernels is around points of the density's fourth root, whose tails are
+        longer: no weight is large there.
+        """
         modes = of_account(self.modes)
         beside = _IN_A_FIT if len(modes) > 1 else 0.0
         fresh = round(_FRESH * min(_MOST_FRESH, 1.0 + 0.25 * max(len(modes) - 1, 0)))
-        self._go_to(z, normalised(log_weights), _FITTED_TO, _WIDTHS, fresh, beside)
+        wide = normalised(log_weights - 0.75 * np.maximum(log_posterior, -1e300))
+        weights = (1.0 - _WIDE) * normalised(log_weights) + _WIDE * wide
+        self._go_to(z, weights / weights.sum(), _FITTED_TO, _WIDTHS, fresh, beside)
 
     def _go_to(
         self,
@@ -261,11 +268,13 @@ def _largest_shape(runs: list[_Run]) -> float:
     return float(np.max([pareto_shape(run.points.log_weights) for run in runs]))
 
 
-def _of_all(runs: list[_Run]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points z (s, p) of all populations and their log weights (s,)."""
+def _of_all(runs: list[_Run]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return points z (s, p) of all populations, log weights and log posterior densities (s,)."""
     populations = [run.points for run in runs]
     log_weights = [points.log_weights - np.log(len(points.z)) for points in populations]
-    return np.concatenate([points.z for points in populations]), np.concatenate(log_weights)
+    log_posterior = np.concatenate([points.log_posterior for points in populations])
+    z = np.concatenate([points.z for points in populations])
+    return z, np.concatenate(log_weights), log_posterior
 
 
 def _evidence(populations: list[PosteriorPoints]) -> dict[str, float]:
@@ -346,11 +355,11 @@ class ImportanceSampling(Sampler):
             complete = all(count == len(runs) for count in counts)
             light = _largest_shape(runs) <= LARGEST_PARETO_SHAPE
             if not (complete and light and converged(draws.z, options.r_hat, options.ess)):
-                z, log_weights = _of_all(runs)
+                points = _of_all(runs)
 
                 def fit(run: _Run) -> None:
                     run.modes = modes
-                    run.fit(z, log_weights)
+                    run.fit(*points)
                     run.settle()
 
                 list(pool.map(fit, runs))
