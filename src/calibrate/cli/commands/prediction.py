@@ -119,10 +119,12 @@ def bands_summary(result: dict[str, Any]) -> str:
         by_source.setdefault(source, []).append(name)
     lines += [f"{', '.join(names)}: {source}" for source, names in by_source.items()]
     lines.append(f"verdict on the posterior: {result['posterior']}")
-    lines.append(
-        f"{result['draws']} draws, {result['fem_runs']} of them by FEM; others are those of a "
-        f"process, which missed tests by {result['missed_sd']:.2g} sd of the draws"
+    others = (
+        f"{result['fem_runs']} of them by FEM; others are those of a process, which missed tests "
+        f"by {result['missed_sd']:.2g} sd of the draws"
     )
+    every = result["fem_runs"] >= result["draws"]
+    lines.append(f"{result['draws']} draws, {'each of them solved' if every else others}")
     lines += [str(Reach(**one)) for one in result["beyond"] if one["share"] > 0.0]
     return "\n".join([*lines, *result["warnings"]])
 
