@@ -160,13 +160,18 @@ def _layouts(file: DataTable) -> dict[str, tuple[type[Observation], Layout]]:
         return complete
     lacking = [[w for w in words if w not in file.words] for words in partial]
     fault = f"{file.what} '{min(lacking, key=len)[0]}' is missing" if partial else "no data"
-    present = "" if partial else ", ".join(filter(None, file.words))
+    present = ", ".join(filter(None, file.words))
     fault += f" in {file.what}s {present}" if present else ""
-    every = " or ".join(
-        ",".join(file.words_of(layout))
-        for name, kind in OBSERVATIONS.items()
-        for layout in kind.layouts((name,)).values()
-    )
+    if partial:
+        every = " or ".join(dict.fromkeys(",".join(words) for words in partial))
+        for likely in offered("emulator.specimens.specimen", "likely_names"):
+            every += likely(file.words)
+    else:
+        every = " or ".join(
+            ",".join(file.words_of(layout))
+            for name, kind in OBSERVATIONS.items()
+            for layout in kind.layouts((name,)).values()
+        )
     raise InputError(f"data file {file.path}: {fault}; expected {file.what}s {every}")
 
 

@@ -64,11 +64,13 @@ class FullField:
         if len(self.points) > 1:
             ways, others = cKDTree(self.points).query(self.points, k=2)
             row = int(np.argmin(ways[:, 1]))
-            if ways[row, 1] < _ONE_PLACE * np.median(ways[:, 1]):
+            # Where every point is there twice, the usual distance is that of twins.
+            spread = float(np.ptp(self.points, axis=0).max()) / len(self.points)
+            usual = max(float(np.median(ways[:, 1])), spread)
+            if ways[row, 1] < _ONE_PLACE * usual:
                 raise InputError(
                     f"full field: points {row + 1} and {others[row, 1] + 1} are "
-                    f"{ways[row, 1]:.2g} mm apart, of {np.median(ways[:, 1]):.2g} usually: one "
-                    "place counts once"
+                    f"{ways[row, 1]:.2g} mm apart, of {usual:.2g} usually: one place counts once"
                 )
 
     def only(self, frames: Sequence[str], points: np.ndarray | None = None) -> FullField:
@@ -289,7 +291,7 @@ def measured_field(
     from calibrate.measurements import parse_observation
 
     (parameter, path, column), field = amount, read_full_field(*files)
-    amounts = read_amounts(path, column)
+    amounts, source = read_amounts(path, column), path
     sign = sign_of(scene, parameter, amounts)
     amounts = {frame: sign * value for frame, value in amounts.items()}
     pulled = [frame for frame in field.frames if amounts.get(frame) != 0.0]
@@ -312,6 +314,9 @@ def measured_field(
             data[in_state(name, frame)] = np.array(np.interp(amounts[frame], at, forces_at))
     known = {in_state(parameter, frame): amounts[frame] for frame in field.frames}
     doubts = [*field_doubts(scene, field, amounts, parameter)]
+    if sign < 0.0:
+        turned = f"amounts of {source}, below 0, are taken as pulls counted the other way round"
+        doubts.insert(0, f"{turned}; give '{parameter}' a range below 0 if they compress")
     return observations(parts), data, known, doubts
 
 

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Self
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial import KDTree
 
 from calibrate.measurements.collection import Observations
 from calibrate.measurements.observation import Block, DataField, Observation, derive
@@ -22,7 +23,7 @@ from emulator.specimens.states import APPLIED, AXES, States
 
 _APART = 1e3  # distance between the points of two tests, whose errors do not correlate
 _ROUND_OFF = 1e-6
-_FEWEST_ALIKE, _DIGITS_ALIKE = 3, 9  # rows, and decimals, in which two tests are the same one
+_FEWEST_ALIKE, _ALIKE = 3, 1e-4  # rows, and share of a range, in which two tests are the same one
 
 
 class SpecimenCurves(PointObservation):
@@ -69,6 +70,10 @@ class SpecimenCurves(PointObservation):
     @abstractmethod
     def _measured(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the numbers (d, c) at the displacement (n, 3) mm of all nodes."""
+
+    def comparable(self, numbers: np.ndarray) -> np.ndarray:
+        """Return numbers (d, c) of the states in one measure, so that two tests can be compared."""
+        return numbers
 
     def tests(self, entries: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """Return the entries (k,) of the data of each test; one without a name where none has any.
@@ -205,22 +210,44 @@ def gripped_observations(observe: Observations, shares: np.ndarray) -> Observati
 
 
 def check_tests(observed: Mapping[str, tuple[Any, np.ndarray]]) -> None:
-    """Raise InputError if two tests of a specimen have the same motions and the same numbers.
+    """Raise InputError if rows of a specimen's tests are there twice.
+
+    The same measurement may come under two names, in two units or as two stresses, with other
+    digits or without its last rows. Rows are alike whose motions are equal, and whose numbers
+    differ by less than 1e-4 of their range: two measurements never agree so well in each of three.
 
     observed : each observation of a load state and its data, by name.
     """
     curves = [(part, y) for part, y in observed.values() if isinstance(part, SpecimenCurves)]
-    seen: dict[bytes, str] = {}
-    for test, rows in curves[0][0].states.protocols.items() if curves else ():
-        if len(rows) < _FEWEST_ALIKE:
-            continue
-        states = curves[0][0].states
-        numbers = [y[rows].reshape(len(rows), -1) for _, y in curves]
-        motion = [a[rows].reshape(len(rows), -1) for a in (states.gradients, states.pulls)]
-        content = np.round(np.hstack([*motion, *numbers]), _DIGITS_ALIKE) + 0.0
-        first = seen.setdefault(content.tobytes(), test)
-        if first != test:
-            raise InputError(
-                f"tests '{first}' and '{test}' have the same {len(rows)} rows, which would count "
-                "twice: leave one out"
-            )
+    if not curves:
+        return
+    states = curves[0][0].states
+    numbers = np.hstack([part.comparable(y.reshape(len(y), -1)) for part, y in curves])
+    motion = np.hstack(
+        [np.nan_to_num(a).reshape(len(numbers), -1) for a in (states.gradients, states.pulls)]
+    )
+    size = np.maximum(np.abs(motion).max(axis=0), np.finfo(float).tiny)
+    tree = KDTree(motion / (_ROUND_OFF * size))
+    first, second = tree.query_pairs(1.0, p=np.inf, output_type="ndarray").reshape(-1, 2).T
+    known, sizes = ~np.isnan(numbers), np.nanmax(np.abs(numbers), axis=0, initial=0.0)
+    both = known[first] & known[second]
+    near = np.abs(numbers[first] - numbers[second]) <= _ALIKE * sizes
+    loaded = (np.nan_to_num(numbers) != 0.0).any(axis=1)
+    alike = both.any(axis=1) & (near | ~both).all(axis=1) & loaded[first]
+    pairs = np.stack([first[alike], second[alike]])
+    test_of = np.empty(len(numbers), dtype=int)
+    tests = list(states.protocols)
+    for k, rows in enumerate(states.protocols.values()):
+        test_of[rows] = k
+    for k, test in enumerate(tests):
+        for j, other in enumerate(tests[: k + 1]):
+            here = np.sort(test_of[pairs], axis=0) == np.array([[j], [k]])
+            rows = pairs[:, here.all(axis=0)]
+            few = min(k, j, key=lambda t: int((loaded & (test_of == t)).sum()))
+            matched = np.unique(rows[test_of[rows] == few]).size
+            if matched >= max(_FEWEST_ALIKE, int((loaded & (test_of == few)).sum())):
+                same = f"the same {int((test_of == few).sum())} rows"
+                whose = f"tests '{other}' and '{test}' have {same}"
+                if other == test:
+                    whose = f"{f"test '{test}'" if test else 'the table'} has its rows twice"
+                raise InputError(f"{whose}, which would count twice: leave one out")

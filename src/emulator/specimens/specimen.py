@@ -50,6 +50,12 @@ _CONVENTIONS = (
     (r"((?:inner|outer)_(?:radius|diameter)|stretch_axial|pressure)", r"\1"),
 )
 """Names of columns by other conventions, in small letters with _ for blanks, and ours for each."""
+_OF_TUBES = (
+    (r"(?:lambda|λ|stretch)_?z", r"stretch_axial"),
+    (r"od", r"outer_diameter"),
+    (r"id", r"inner_diameter"),
+    (r"p", r"pressure"),
+)
 _MACHINES = {
     r"(extension|displacement|elongation|crosshead).*": "over the length at rest is strain_x [-]",
     r"(load|force)(_.*)?": "is force_x, beside a column area_x [mm2]",
@@ -234,7 +240,8 @@ def read_states(table: Path | Cells, tube: Tube | None = None) -> States:
         usual = "stretch_x, strain_x or shear_xy" if tube is None else "outer_radius, stretch_axial"
         raise InputError(
             f"data file {path}: no column says how the specimen moves: {usual}"
-            f"{_likely(cells.words)}; it has {', '.join(filter(None, cells.words))}"
+            f"{likely_names(cells.words, of_tube=tube is not None)}; it has "
+            + ", ".join(filter(None, cells.words))
         )
     columns = {w: np.array([cells.number(k, w, gaps=True) for k in rows]) for w in words}
     names = [cells.rows[k][PROTOCOL] for k in rows] if PROTOCOL in cells.words else None
@@ -249,13 +256,14 @@ def read_states(table: Path | Cells, tube: Tube | None = None) -> States:
         raise InputError(f"data file {path}: {text}") from error
 
 
-def _likely(words: Sequence[str]) -> str:
+def likely_names(words: Sequence[str], *, of_tube: bool = False) -> str:
     """Suggest names for columns that follow other conventions."""
     renamed, described = [], []
+    conventions = _OF_TUBES + _CONVENTIONS if of_tube else _CONVENTIONS
     for word in words:
         name, unit = with_unit(word)
         plain = name.lower().replace(" ", "_")
-        matches = ((re.fullmatch(pattern, plain), ours) for pattern, ours in _CONVENTIONS)
+        matches = ((re.fullmatch(pattern, plain), ours) for pattern, ours in conventions)
         ours = next((match.expand(ours) for match, ours in matches if match is not None), name)
         if ours != name:
             renamed.append(f"{word} {ours}{f' [{unit}]' if unit else ''}")

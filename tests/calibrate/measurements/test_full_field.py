@@ -234,6 +234,10 @@ def test_a_place_counts_once(field):
     u = np.concatenate([field.displacement, field.displacement[:, 3:4]], axis=1)
     with pytest.raises(InputError, match=r"points 4 and 13 are 1.4e-06 mm apart, .* counts once"):
         FullField(points, u, field.frames)
+    every = np.vstack([field.points, field.points + 1e-6])
+    u = np.concatenate([field.displacement, field.displacement], axis=1)
+    with pytest.raises(InputError, match=r"are 1.4e-06 mm apart, of 0.\d+ usually: one place"):
+        FullField(every, u, field.frames)
 
 
 @pytest.mark.parametrize(

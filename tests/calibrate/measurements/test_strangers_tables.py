@@ -90,6 +90,71 @@ def test_one_measurement_counts_once(tmp_path):
     draft(tmp_path, "stretch_x,stress_x,cauchy_x", STRETCH, *first)
 
 
+HALF = [""] * 30
+
+
+@pytest.mark.parametrize(
+    ("columns", "first", "second"),
+    [
+        ("stress_x [kPa],cauchy_x [kPa]", (STRESS, HALF), (HALF, STRESS * STRETCH)),
+        ("stress_x [kPa],second_x [kPa]", (STRESS, HALF), (HALF, STRESS / STRETCH)),
+        ("stress_x [kPa],stress_x [MPa]", (STRESS, HALF), (HALF, 1e-3 * STRESS)),
+        ("stress_x [kPa]", (STRESS,), (np.round(STRESS, 4),)),
+        ("stress_x [kPa]", (STRESS,), (np.append(STRESS[:-3], [50.0, 60.0, 70.0]),)),
+    ],
+)
+def test_one_measurement_under_two_names_counts_once(tmp_path, columns, first, second):
+    """As two stresses, in two units, with fewer digits; one that ends elsewhere is another."""
+    tests = np.repeat(["a", "b"], 30)
+    both = [np.concatenate(pair) for pair in zip(first, second, strict=True)]
+    header = f"protocol,stretch_x,{columns}"
+    if second[0][-1] == 70.0:
+        draft(tmp_path, header, tests, np.tile(STRETCH, 2), *both)
+        return
+    told = refusal(tmp_path, header, tests, np.tile(STRETCH, 2), *both)
+    assert "tests 'a' and 'b' have the same" in told
+
+
+def test_a_test_without_its_last_rows_and_rows_that_are_there_twice(tmp_path):
+    tests = ["a"] * 30 + ["b"] * 25
+    pulls, stresses = np.append(STRETCH, STRETCH[:25]), np.append(STRESS, STRESS[:25])
+    told = refusal(tmp_path, "protocol,stretch_x,stress_x", tests, pulls, stresses)
+    assert "tests 'a' and 'b' have the same 25 rows" in told
+    told = refusal(tmp_path, "stretch_x,stress_x", np.repeat(STRETCH, 2), np.repeat(STRESS, 2))
+    assert "the table has its rows twice" in told
+    # Two specimens in one machine: the same stretches, noise of a thousandth.
+    noise = 1e-3 * STRESS.max() * np.random.default_rng(0).normal(size=60)
+    tests, again = np.repeat(["a", "b"], 30), np.tile(STRESS, 2) + noise
+    draft(tmp_path, "protocol,stretch_x,stress_x", tests, np.tile(STRETCH, 2), again)
+
+
+def test_tests_in_two_units_are_both_read(tmp_path):
+    stress = STRESS + 0.1 * np.random.default_rng(0).normal(size=30)
+    both = np.concatenate([STRESS, HALF]), np.concatenate([HALF, 1e-3 * stress])
+    path = table(
+        tmp_path / "t.csv", "protocol,stretch_x,stress_x [kPa],stress_x [MPa]",
+        np.repeat(["a", "b"], 30), np.tile(STRETCH, 2), *both,
+    )  # fmt: skip
+    draft_specimen(path, tmp_path / "x.toml")
+    _, data, _ = read_measurements(read_scene(tmp_path / "x_scene.toml"), path)
+    np.testing.assert_allclose(data["stress"].ravel(), np.append(STRESS, stress), rtol=1e-9)
+
+
+def test_columns_of_other_conventions_are_named(tmp_path):
+    told = refusal(tmp_path, "stretch_x,sigma_xx [kPa]", STRETCH, STRESS)
+    assert "'stress_x' is missing in columns stretch_x, sigma_xx [kPa]" in told
+    assert told.endswith("call sigma_xx [kPa] cauchy_x [kPa] if they are that")
+    tube = Tube(0.36, (0.1,))
+    radius = np.linspace(0.4, 0.5, 30)
+    words = "OD (mm),lambda_z,P (mmHg)"
+    told = refusal(tmp_path, words, 2.0 * radius, np.full(30, 1.2), STRESS, tube=tube)
+    assert "OD (mm) outer_diameter [mm], lambda_z stretch_axial, P (mmHg) pressure [mmHg]" in told
+    words = "inner_radius,stretch_axial,pressure [mmHg],pressure [kPa]"
+    columns = radius, np.full(30, 1.2), STRESS, STRESS
+    told = refusal(tmp_path, words, *columns, tube=tube)
+    assert "pressure [mmHg], pressure [kPa]: each is the pressure of a row" in told
+
+
 def test_spreadsheets_leave_empty_rows_and_columns(tmp_path):
     text = "stretch_x,stress_x,\n" + "".join(
         f"{a},{b},\n" for a, b in zip(STRETCH, STRESS, strict=True)
