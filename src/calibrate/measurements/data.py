@@ -160,11 +160,12 @@ def _layouts(file: DataTable) -> dict[str, tuple[type[Observation], Layout]]:
         return complete
     lacking = [[w for w in words if w not in file.words] for words in partial]
     fault = f"{file.what} '{min(lacking, key=len)[0]}' is missing" if partial else "no data"
-    present = ", ".join(filter(None, file.words))
+    of_table = file.what == "column"
+    present = ", ".join(filter(None, file.words)) if of_table or not partial else ""
     fault += f" in {file.what}s {present}" if present else ""
     if partial:
         every = " or ".join(dict.fromkeys(",".join(words) for words in partial))
-        for likely in offered("emulator.specimens.specimen", "likely_names"):
+        for likely in offered("emulator.specimens.specimen", "likely_names") if of_table else ():
             every += likely(file.words)
     else:
         every = " or ".join(

@@ -35,6 +35,11 @@ _ONE_PLACE = 1e-3  # of the usual distance: points nearer to each other are one
 _FARTHER = 3.0  # times what pulls the body: its points do not move more
 _AGAINST = -0.1  # of the pull: the points' mean motion does not go against it
 _ASIDE = 0.2  # of the strain along a pull: a body does not grow more across it
+_ZIGZAG = 0.04  # of the range of forces: a value differs less from its neighbours' mean
+_TURNED = (
+    "amounts of {}, below 0, are taken as pulls counted the other way round; give '{}' a range "
+    "below 0 if they compress"
+)
 _MATRICES = ("x", "y", "ux", "uy")
 
 
@@ -218,6 +223,22 @@ def _side(amounts: Sequence[float] | np.ndarray) -> int:
     return int(low >= 0.0) - int(high <= 0.0)
 
 
+def _zigzag(path: str | Path, values: np.ndarray) -> Iterator[str]:
+    """Yield a question where the values (k,) of a rising curve go up and down between neighbours.
+
+    Of a value and the mean of its neighbours the difference is small, but where two branches of a
+    cycle were sorted into one.
+    """
+    size = float(np.ptp(values)) if len(values) > 4 else 0.0
+    if size > 0.0:
+        gap = float(np.median(np.abs(values[1:-1] - 0.5 * (values[:-2] + values[2:])))) / size
+        if gap > _ZIGZAG:
+            yield (
+                f"{path}: a force and its neighbours differ by {100 * gap:.0f} % of the range: are "
+                "loading and unloading sorted into one curve? give the rows of loading alone"
+            )
+
+
 def read_curve(
     path: str | Path, amount: str, value: str, like: Sequence[float] = ()
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -298,9 +319,10 @@ def measured_field(
     chosen = spread_points(field.points, min(points, len(field.points)))
     field = field.only(frames or pulled, chosen)
     observe, data = field_data(scene, field, amounts)
-    parts = dict(observe.parts)
+    parts, beside = dict(observe.parts), list[str]()
     for word, path, pull, force in forces:
         at, forces_at = read_curve(path, pull, force, list(amounts.values()))
+        beside += [*_zigzag(path, forces_at)]
         ((name, part),) = parse_observation(scene, word, 0).parts.items()
         if in_state(name, field.frames[0]) in parts:
             raise InputError(f"force: {word} is given twice; give one curve for each")
@@ -313,10 +335,9 @@ def measured_field(
             parts[in_state(name, frame)] = part
             data[in_state(name, frame)] = np.array(np.interp(amounts[frame], at, forces_at))
     known = {in_state(parameter, frame): amounts[frame] for frame in field.frames}
-    doubts = [*field_doubts(scene, field, amounts, parameter)]
+    doubts = [*field_doubts(scene, field, amounts, parameter), *beside]
     if sign < 0.0:
-        turned = f"amounts of {source}, below 0, are taken as pulls counted the other way round"
-        doubts.insert(0, f"{turned}; give '{parameter}' a range below 0 if they compress")
+        doubts.insert(0, _TURNED.format(source, parameter))
     return observations(parts), data, known, doubts
 
 

@@ -158,7 +158,7 @@ def check_values(part: Observation, name: str, values: np.ndarray) -> None:
     if infinite.any():
         if not values.shape:
             raise InputError(f"data: {name} is {values}; it must be finite")
-        row = int(np.argwhere(infinite)[0, 0])
+        row = int(np.argwhere(infinite)[0, 0]) + 1
         raise InputError(f"data: {name}, row {row} has an infinite value")
     if fault := part.fault(name, values):
         raise InputError(f"data: {fault}")

@@ -9,6 +9,7 @@ import pytest
 import emulator as em  # noqa: F401 - float64
 from calibrate.measurements.full_field import (
     FullField,
+    _zigzag,
     field_data,
     field_doubts,
     read_amounts,
@@ -111,6 +112,16 @@ def test_a_pull_keeps_its_sign_unless_the_scene_knows_one_alone():
     assert [sign_of(scene, "pull", amounts) for scene in scenes] == [-1.0, 1.0]
     assert sign_of(scenes[0], "pull", {"1": -0.5, "2": 0.5}) == 1.0
     assert sign_of(scenes[0], "pull", {"1": 0.0, "2": 0.5}) == 1.0
+
+
+def test_branches_of_a_cycle_that_were_sorted_into_one_are_asked_about():
+    pull = np.linspace(0.0, 1.0, 21)
+    loading, unloading = pull**2, 0.6 * pull**2
+    noisy = loading + 0.01 * np.random.default_rng(0).normal(size=21)
+    assert list(_zigzag("f.csv", loading)) == list(_zigzag("f.csv", noisy)) == []
+    both = np.where(np.arange(21) % 2, loading, unloading)
+    (said,) = _zigzag("f.csv", both)
+    assert "are loading and unloading sorted into one curve?" in said
 
 
 def test_points_are_spread_over_the_field():

@@ -112,7 +112,9 @@ def test_an_interrupted_campaign_goes_on(scene, tmp_path, monkeypatch, solved):
     monkeypatch.setattr(ZarrRows, "write", write)
     solved.clear()
     found = cal.campaign(scene, 6, out=path)
-    np.testing.assert_array_equal(solved, sobol(scene, 6, 0)[3:])
+    # Threads begin them in order, and may end in another one.
+    again = sorted(np.asarray(theta).tolist() for theta in solved)
+    assert again == sorted(np.asarray(sobol(scene, 6, 0)[3:]).tolist())
     assert_whole(found, scene, 6)
     assert [p.name for p in tmp_path.iterdir()] == ["runs.zarr"]
 

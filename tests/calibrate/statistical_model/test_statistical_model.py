@@ -141,7 +141,7 @@ def test_a_single_observation_takes_data_and_noise_as_they_are(ventricle, data):
         ({"volume": np.ones(2)}, r"shape \(2,\); the observation expects \(\) \(volume, mL\)"),
         ({"volume": np.nan}, "1 of 1 values of volume are missing"),
         ({"volume": np.inf}, "volume is inf; it must be finite"),
-        ({"displacement": np.full((5, 3), np.inf)}, "displacement, row 0 has an infinite value"),
+        ({"displacement": np.full((5, 3), np.inf)}, "displacement, row 1 has an infinite value"),
         ({"volume": -3.0}, "volume is -3.0 mL; it must be above 0"),
         ({"displacement": np.ones((4, 3))}, r"expects \(5, 3\) \(displacement, mm\)"),
         ({"pressure": 1.0}, "data: 'pressure' is not observed; observed: displacement, volume"),

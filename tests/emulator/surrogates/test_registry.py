@@ -87,7 +87,7 @@ def test_every_kind_builds_a_map_with_its_name_and_its_own_fingerprint():
         assert forward.label
         np.testing.assert_array_equal(forward.nodes, np.arange(len(scene.mesh.nodes)))
     assert len({forward.fingerprint for forward in maps.values()}) == len(maps)
-    assert maps["corrected"].label == "emulator + 1 Newton step"
+    assert maps["corrected"].label == "graph network + 1 Newton step"
     # Built again, a map is the same one; with other solver options FEM is another.
     for name in ("emulator", "corrected", "fem"):
         again = build_forward(name, Ingredients(scene, em.Simulator(scene)))
