@@ -278,6 +278,18 @@ def test_doubts_are_said_by_the_command(cases, scale, question, tmp_path, capsys
     assert [question in line for line in told["warnings"]] == ([] if question is None else [True])
 
 
+def test_amounts_that_are_turned_are_said(cases, tmp_path, capsys):
+    """A machine that counts pulls as negative, in a scene that knows positive ones."""
+    folder = cases / "tables" / "two_forces"
+    (tmp_path / "amount.csv").write_text("frame,pull\n1,-0.4\n2,-0.8\n")
+    words = ["frames", folder / "plate.toml", "--field", folder / "points.csv"]
+    words += [folder / "moved.csv", "--amount", f"pull={tmp_path / 'amount.csv'}:pull"]
+    code, told = answer(capsys, *words, "--out", tmp_path / "field.csv")
+    assert code == 0
+    (said,) = told["warnings"]
+    assert "are taken as pulls counted the other way round; give 'pull' a range below 0" in said
+
+
 @pytest.mark.parametrize("name", ["keloid", "healthy"])
 def test_measured_skin_raises_no_doubt(measured, name):
     folder = measured / "living_skin"
