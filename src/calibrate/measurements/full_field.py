@@ -69,7 +69,7 @@ class FullField:
         if len(self.points) > 1:
             ways, others = cKDTree(self.points).query(self.points, k=2)
             row = int(np.argmin(ways[:, 1]))
-            # Where every point is there twice, the usual distance is that of twins.
+            # If every point is there twice, the median is the distance of the two.
             spread = float(np.ptp(self.points, axis=0).max()) / len(self.points)
             usual = max(float(np.median(ways[:, 1])), spread)
             if ways[row, 1] < _ONE_PLACE * usual:
@@ -226,8 +226,8 @@ def _side(amounts: Sequence[float] | np.ndarray) -> int:
 def _zigzag(path: str | Path, values: np.ndarray) -> Iterator[str]:
     """Yield a question where the values (k,) of a rising curve go up and down between neighbours.
 
-    Of a value and the mean of its neighbours the difference is small, but where two branches of a
-    cycle were sorted into one.
+    A value differs little from the mean of its neighbours, unless the two branches of a cycle were
+    sorted into one.
     """
     size = float(np.ptp(values)) if len(values) > 4 else 0.0
     if size > 0.0:

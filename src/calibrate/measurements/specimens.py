@@ -223,31 +223,39 @@ def check_tests(observed: Mapping[str, tuple[Any, np.ndarray]]) -> None:
         return
     states = curves[0][0].states
     numbers = np.hstack([part.comparable(y.reshape(len(y), -1)) for part, y in curves])
-    motion = np.hstack(
-        [np.nan_to_num(a).reshape(len(numbers), -1) for a in (states.gradients, states.pulls)]
-    )
-    size = np.maximum(np.abs(motion).max(axis=0), np.finfo(float).tiny)
-    tree = KDTree(motion / (_ROUND_OFF * size))
-    first, second = tree.query_pairs(1.0, p=np.inf, output_type="ndarray").reshape(-1, 2).T
-    known, sizes = ~np.isnan(numbers), np.nanmax(np.abs(numbers), axis=0, initial=0.0)
-    both = known[first] & known[second]
-    near = np.abs(numbers[first] - numbers[second]) <= _ALIKE * sizes
+    motion = np.hstack([a.reshape(len(numbers), -1) for a in (states.gradients, states.pulls)])
+    # In units of what two readings of one measurement may differ by.
+    motion, numbers = _in_shares(motion, _ROUND_OFF), _in_shares(numbers, _ALIKE)
+    known = np.isfinite(numbers)
     loaded = (np.nan_to_num(numbers) != 0.0).any(axis=1)
-    alike = both.any(axis=1) & (near | ~both).all(axis=1) & loaded[first]
-    pairs = np.stack([first[alike], second[alike]])
-    test_of = np.empty(len(numbers), dtype=int)
-    tests = list(states.protocols)
-    for k, rows in enumerate(states.protocols.values()):
-        test_of[rows] = k
-    for k, test in enumerate(tests):
-        for j, other in enumerate(tests[: k + 1]):
-            here = np.sort(test_of[pairs], axis=0) == np.array([[j], [k]])
-            rows = pairs[:, here.all(axis=0)]
-            few = min(k, j, key=lambda t: int((loaded & (test_of == t)).sum()))
-            matched = np.unique(rows[test_of[rows] == few]).size
-            if matched >= max(_FEWEST_ALIKE, int((loaded & (test_of == few)).sum())):
-                same = f"the same {int((test_of == few).sum())} rows"
-                whose = f"tests '{other}' and '{test}' have {same}"
-                if other == test:
-                    whose = f"{f"test '{test}'" if test else 'the table'} has its rows twice"
-                raise InputError(f"{whose}, which would count twice: leave one out")
+
+    def are_in(few: np.ndarray, many: np.ndarray) -> bool:
+        """Return whether each of the rows ``few`` is among ``many``, or there again if they are."""
+        both = known[few].any(axis=0) & known[many].any(axis=0)
+        points = np.hstack([motion, np.nan_to_num(numbers[:, both])])
+        nearest = 2 if few is many else 1
+        gaps, _ = KDTree(points[many]).query(points[few], k=[nearest], p=np.inf)
+        return bool(both.any() and (gaps <= 1.0).all())
+
+    earlier: dict[str, np.ndarray] = {}
+    for test, every in states.protocols.items():
+        rows = every[loaded[every]]
+        if len(rows) < _FEWEST_ALIKE:
+            continue
+        if are_in(rows, rows):
+            whose = f"test '{test}'" if test else "the table"
+            raise InputError(f"{whose} has its rows twice, which would count twice: leave one out")
+        for other, others in earlier.items():
+            if are_in(*sorted((rows, others), key=len)):
+                count = min(len(every), len(states.protocols[other]))
+                raise InputError(
+                    f"tests '{other}' and '{test}' have the same {count} rows, which would count "
+                    "twice: leave one out"
+                )
+        earlier[test] = rows
+
+
+def _in_shares(values: np.ndarray, share: float) -> np.ndarray:
+    """Return columns (d, c) as multiples of a share of the largest number of each."""
+    size = np.nanmax(np.abs(values), axis=0, initial=0.0)
+    return values / (share * np.where(size > 0.0, size, 1.0))

@@ -56,15 +56,15 @@ class OfTube(SpecimenCurves):
     @classmethod
     def layouts(cls, words: Collection[str]) -> dict[str, Layout]:
         """Return the layout of the columns of motion and of the number; none without motion."""
-        numbers = [w for w in words if with_unit(w)[0] == cls.column] or [cls.column]
-        if len(numbers) > 1:
-            raise InputError(
-                f"columns {', '.join(numbers)}: each is the {cls.column} of a row; leave one"
-            )
-        (number,) = numbers
         motion = motion_columns(words)
         if not motion and cls.name not in words:  # a column 'pressure' may be of another file
             return {}
+        number, *more = [w for w in words if with_unit(w)[0] == cls.column] or [cls.column]
+        if more:
+            raise InputError(
+                f"columns {', '.join([number, *more])}: each is the {cls.column} of a row; leave "
+                "one"
+            )
         columns = [*(motion or ["outer_radius", "stretch_axial"]), number]
         fields = [DataField(word, (word,), where=word != number) for word in columns]
         return {cls.name: Layout((), tuple(fields))}

@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 
 from calibrate.figures import BLUE, panels, save, with_unit
+from calibrate.posterior.diagnosis import places_of
 from calibrate.prediction.beyond import Reach
 from calibrate.prediction.predict import Predicted
 from calibrate.state_names import in_state, split
@@ -26,8 +27,8 @@ PREDICTION = "prediction.nc"
 def numbers(predicted: Predicted) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the name of each predicted number, and its unit, mean, sd and quantiles."""
     for name, row in predicted.summary().items():
-        for place in np.ndindex(row["mean"].shape):
-            label = name if row["mean"].size == 1 else f"{name}[{', '.join(map(str, place))}]"
+        shape = row["mean"].shape
+        for label, place in zip(places_of(name, shape), np.ndindex(shape), strict=True):
             yield label, {k: v if k == "unit" else float(v[place]) for k, v in row.items()}
 
 

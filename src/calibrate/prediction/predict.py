@@ -23,6 +23,7 @@ from calibrate.measurements import Observation, Observations, observations
 from calibrate.noise import GaussianNoise
 from calibrate.posterior import Posterior
 from calibrate.prediction.transfer import Learned, Transfer, transfer
+from calibrate.state_names import in_state
 from calibrate.statistical_model import FEMLikelihood, Model
 from calibrate.statistical_model.fem_likelihood import runs_of
 from calibrate.statistical_model.model import model
@@ -126,7 +127,7 @@ def predict_on(
     target = transfer(learned, scene, several, known or {}, draws, rng)
     thetas = target.states.thetas(target.draws)
     if not isinstance(target.scene, Scene):
-        return _of_states(target, several, thetas)
+        return _of_states(learned, target, several, thetas)
     simulator = Simulator(target.scene, NewtonOptions.load_steps(load_steps))
     kept: dict[bytes, Field] = {}
     at_rest = Emulator(target.scene).cache()
@@ -154,7 +155,7 @@ def _model(forward: CachedEmulator, observe: Observations, target: Transfer) -> 
     """Return a model whose unknowns are the target draws'; its noise is of no consequence."""
     entries = zip(target.states.states, target.states.entries, strict=True)
     known = {
-        f"{name}@{state}" if state else name: source
+        in_state(name, state): source
         for state, row in entries
         for name, source in zip(target.scene.parameter_names, row, strict=True)
         if isinstance(source, float)
@@ -200,10 +201,16 @@ def _by_process(
         runs = FEMRuns.joined([runs, tests])
 
 
-def _of_states(target: Transfer, observe: Observations, thetas: jax.Array) -> Predicted:
-    """Return the predictions of a specimen, whose states are solved at each draw."""
+def _of_states(
+    learned: Learned, target: Transfer, observe: Observations, thetas: jax.Array
+) -> Predicted:
+    """Return the predictions of a specimen, whose states are solved at each draw.
+
+    They keep their volume where those that the draws were learned on did.
+    """
+    incompressible = all(getattr(body, "incompressible", False) for body, _ in learned.bodies)
     (homogeneous,) = offered("emulator.specimens.homogeneous", "homogeneous")
-    forward = homogeneous(target.scene)
+    forward = homogeneous(target.scene, incompressible=incompressible)
     data, valid = jax.jit(lambda t: jax.lax.map(observe.through(forward), t))(thetas)
     valid = np.asarray(valid)
     failed = int((~valid).sum())

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any, cast
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from calibrate.importance.proposals import key_from
 from calibrate.measurements import Observations
 from calibrate.posterior import Posterior
+from calibrate.priors.wide import stated_prior, widened
 from calibrate.project import read_posterior
 from calibrate.project.results import MEMBERS
 from calibrate.state_names import split
@@ -20,7 +21,6 @@ from calibrate.statistical_model.load_states import LoadStates, load_states
 from emulator.core.errors import InputError
 from emulator.mechanics.laws.law import law_identity
 from emulator.scenes.forward_problem import ForwardProblem
-from emulator.scenes.parameter_space import Parameter
 from emulator.surrogates.protocol import ForwardMap
 
 _BULK = "kappa"  # the parameter of compressible laws that an incompressible specimen has no use for
@@ -122,27 +122,29 @@ def transfer(
             values[name], sources[name] = fixed[name], f"{fixed[name]:g}, as for the posterior"
     size = len(next(iter(inferred.values())))
     rows = np.sort(rng.choice(size, size=min(count, size), replace=False))
-    states = load_states(scene, observe.states, None, values)[0]
-    parameters = {parameter.name: parameter for parameter in scene.parameters}
+    stated = stated_prior(scene)
+    if stated is not None:
+        scene = widened(scene, stated)
+    prior = {n: d for n, d in (stated.prior(scene) if stated else {}).items() if n not in values}
+    states, priors = load_states(scene, observe.states, prior, values)
     draws = dict[str, np.ndarray]()
     for name in states.unknowns:
         base = split(name)[0]
         if name in inferred and base in material:
             draws[name], sources[base] = inferred[name][rows], "the posterior"
         else:
-            draws[name], sources[name] = _of_prior(parameters[base], len(rows), rng)
+            sample = priors[name].sample(key_from(rng), (len(rows),))
+            draws[name], sources[name] = np.asarray(sample), _prior_in_words(scene, base)
     wide = _wide_enough(scene, states, draws)
     return Transfer(wide, states, draws, sources)
 
 
-def _of_prior(parameter: Parameter, count: int, rng: np.random.Generator) -> tuple[np.ndarray, str]:
-    """Return draws (count,) of a parameter's prior, and the prior in words."""
+def _prior_in_words(scene: ForwardProblem, name: str) -> str:
+    """Return what a scene says of a parameter: its stated prior, or else its range."""
+    (parameter,) = (p for p in scene.parameters if p.name == name)
     if (prior := parameter.prior) is not None:
-        draws = prior.median * np.exp(prior.log_sd * rng.normal(size=count))
-        words = f"median {prior.median:.4g}, log sd {prior.log_sd:.2g}"
-        return draws, f"its prior in the scene, {words}"
-    draws = np.asarray(parameter.from_unit(jnp.asarray(rng.random(count))))
-    return draws, f"its range in the scene, {parameter.low:g} to {parameter.high:g}"
+        return f"its prior in the scene, median {prior.median:.4g}, log sd {prior.log_sd:.2g}"
+    return f"its range in the scene, {parameter.low:g} to {parameter.high:g}"
 
 
 def _wide_enough(

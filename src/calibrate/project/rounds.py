@@ -328,7 +328,7 @@ def _read(path: Path, fingerprint: str) -> tuple[dict[bytes, Field], _Draws]:
     thetas, *fields = (widened(arrays[name]) for name in _ARRAYS)
     rows = zip(*fields, strict=True)
     kept = {theta.tobytes(): Field(*row) for theta, row in zip(thetas, rows, strict=True)}
-    return kept, json.loads(metadata[_EARLIER])
+    return kept, json.loads(metadata.get(_EARLIER, "{}"))
 
 
 def keep_for_later(path: Path, posterior: Posterior) -> None:

@@ -147,7 +147,7 @@ class MeshError:
     def _combined(self, coarse: jax.Array, known: Sequence[MeshErrorEstimate]) -> jax.Array:
         """Return the combination (f, 3) mm of ``known`` solutions that is closest to ``coarse``.
 
-        What is left of ``coarse`` is prolonged.
+        The remainder of ``coarse`` is prolonged.
         """
         # In NumPy: JAX would compile a program for each number of them.
         solutions, u = np.stack([np.asarray(o.coarse) for o in known]), np.asarray(coarse)

@@ -55,7 +55,7 @@ class ForwardProblem(TableRepr):
 
     @property
     def learned_in_box(self) -> bool:
-        """Whether a part of the problem was learned from data inside the box of theta only."""
+        """Say whether a part of the problem was learned inside the box of theta only."""
         return False
 
     @property

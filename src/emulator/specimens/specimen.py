@@ -104,7 +104,7 @@ class Specimen(ForwardProblem):
 
     @property
     def learned_in_box(self) -> bool:
-        """Whether the stresses of grips were learned, from FEM inside the box of theta."""
+        """Say whether the stresses of grips were learned from FEM inside the box of theta."""
         return self.grips is not None and self.grips.learned is not None
 
     def __post_init__(self) -> None:

@@ -10,12 +10,14 @@ import calibrate as cal
 import emulator as em
 from calibrate.cli import main
 from calibrate.prediction import Learned, predict_on
-from calibrate.prediction.beyond import reaches
+from calibrate.prediction.beyond import _measures, reaches
 from calibrate.samplers.laplace import LaplaceOptions
 from emulator.core.errors import InputError, SolverError
 from emulator.fem.campaign import workers
 from emulator.fem.solution import Status
 from emulator.scenes.parameter_space import LogNormal, Parameter
+from emulator.specimens.homogeneous import homogeneous
+from emulator.specimens.states import states
 from emulator.surrogates.taylor import expand
 
 DRAWS = LaplaceOptions(draws=200, chains=2, starts=2)
@@ -137,6 +139,36 @@ def test_a_larger_load_reaches_beyond_the_data(posterior, beam):
     assert far.learned[0] <= 3.0
 
 
+def test_measures_of_a_pulled_block_are_those_of_its_gradient():
+    """A body and a specimen, by F = diag(1.3, 0.9, 0.8) and fibres at 30 degrees to x."""
+    stretch, angle = np.array([1.3, 0.9, 0.8]), np.pi / 6.0
+    fibre = np.array([np.cos(angle), np.sin(angle), 0.0])
+    exact = {"I1": (stretch**2).sum(), "I4f": ((stretch * fibre) ** 2).sum()}
+    law = em.find_law("holzapfel_ogden")
+    constants = dict(zip(law.parameters, (1.0, 2.0, 3.0, 4.0, 25.0), strict=True))
+    parameter = Parameter(law.parameters[0], "kPa", 0.5, 2.0)
+    del constants[parameter.name]
+    mesh = em.generators.box((2.0, 1.0, 1.0), (2, 1, 1))
+    body = em.Scene(
+        name="block", mesh=mesh, law=law, parameters=(parameter,), loads=(),
+        supports=(em.Support("left"),), constants=constants,
+        fibres=np.tile(fibre, (len(mesh.elements), 1)),
+    )  # fmt: skip
+    u = mesh.nodes * (stretch - 1.0)
+    for name, (values, weights) in _measures(lambda _: u, body, body.centre).items():
+        np.testing.assert_allclose(values, exact[name], rtol=1e-12)
+        assert weights.sum() == pytest.approx(2.0)
+    columns = {
+        f"stretch_{axis}": np.array([value]) for axis, value in zip("xyz", stretch, strict=True)
+    }
+    piece = em.specimens.Specimen(
+        name="piece", states=states(columns), law=law, parameters=(parameter,),
+        constants=constants, fibres=fibre,
+    )  # fmt: skip
+    told = _measures(homogeneous(piece), piece, piece.centre)
+    assert {name: float(values[0]) for name, (values, _) in told.items()} == pytest.approx(exact)
+
+
 TABLE = "stretch_x,stress_x [kPa]\n" + "".join(
     f"{x},{30.0 * (x - x**-2):.4f}\n" for x in (1.0, 1.05, 1.1, 1.15, 1.2)
 )
@@ -178,6 +210,8 @@ def test_from_a_specimen_to_a_body_and_to_another_test_by_command(tmp_path, caps
     assert row["sd"] == pytest.approx(mu["sd"] * (1.5 - 1.5**-2), rel=0.1)
     (beyond,) = told["beyond"]
     assert beyond["share"] == 0.5
+    assert beyond["learned"] == pytest.approx([3.0, 1.2**2 + 2.0 / 1.2])
+    assert beyond["reached"] == pytest.approx([3.0, 1.5**2 + 2.0 / 1.5])
     words = ["--observe", "nodes:4", "--draws", "60", "--out", "p"]
     assert main([*ask, "body.toml", *words]) == 0
     out = capsys.readouterr().out

@@ -24,16 +24,25 @@ from calibrate.project import (
     read_problem,
     simulator_of,
 )
-from calibrate.project.rounds import Round, _are_foreseen
+from calibrate.project.rounds import Round, _are_foreseen, _read
 from calibrate.report.charts import traces
 from calibrate.report.page import html_of
 from calibrate.statistical_model.fem_likelihood import FEMLikelihood
 from emulator.core.errors import InputError, SolverError
+from emulator.core.store import read_arrays, save_arrays
 from emulator.fem.campaign import workers
 from emulator.fem.solution import Status
 from emulator.scenes.built_in import BUILT_IN
 from emulator.surrogates.correction import correction_at
 
+PULLED = """
+mesh = "own.vtu"
+law = "neo_hookean"
+loads = [{kind = "dead_pressure", facet_set = "right", parameter = "pull"}]
+supports = [{node_set = "left"}]
+parameters = {mu = {unit = "kPa", range = [50, 100]}, pull = {unit = "kPa", range = [0.5, 3]}}
+constants = {lam = 60}
+"""
 BEAM = "once_clamped_beam"
 # The beam's range is 50 to 100 kPa in both moduli; neither is in it.
 TRUTH = {"mu": 190.0, "lam": 33.0}
@@ -169,6 +178,31 @@ def test_another_noise_begins_with_all_runs_of_the_folder(folder, tmp_path, monk
     for name, value in TRUTH.items():
         row = posterior.summary()[name]
         assert abs(row["mean"] - value) < 3.0 * row["sd"], name
+
+
+def test_a_further_load_state_is_all_that_is_solved_at_earlier_draws(tmp_path, monkeypatch):
+    """And a file of solutions of an earlier version, which names no draws, begins nothing."""
+    em.write_mesh(tmp_path / "own.vtu", em.generators.box((40.0, 10.0, 10.0), (4, 1, 2)))
+    (tmp_path / "own.toml").write_text(PULLED)
+    solve, solved = workers.Solver.__call__, []
+    monkeypatch.setattr(
+        workers.Solver, "__call__", lambda solver, task: solved.append(1) or solve(solver, task)
+    )
+    run = Run(
+        str(tmp_path / "own.toml"), forward="rounds", truth={"mu": 60.0},
+        known={"pull@a": 1.0}, observe="nodes:3", noise={"displacement": 0.2}, draws=200,
+    )  # fmt: skip
+    first = infer(run, tmp_path / "r", check_map=False)
+    before = len(first.taught_at()["mu"])
+    solved.clear()
+    more = replace(run, known={"pull@a": 1.0, "pull@b": 2.0})
+    again = infer(more, tmp_path / "r", check_map=False, force=True)
+    fresh = len(again.taught_at()["mu"]) - before
+    assert len(solved) == before + 2 * fresh
+    arrays, metadata = read_arrays(tmp_path / "r" / "solutions.safetensors")
+    del metadata["draws"]
+    save_arrays(tmp_path / "old.safetensors", arrays, metadata)
+    assert _read(tmp_path / "old.safetensors", metadata["of"])[1] == {}
 
 
 def test_fem_that_fails_in_a_third_of_the_prior_costs_runs_and_nothing_else(monkeypatch):

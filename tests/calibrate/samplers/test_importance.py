@@ -14,7 +14,7 @@ from calibrate.importance.weights import normalised
 from calibrate.posterior.diagnosis import diagnose
 from calibrate.samplers import Density, ImportanceOptions, density_of, find_sampler
 from calibrate.samplers.auto import AUTO, NOT_BY_IMPORTANCE, SAMPLED_BY, AutoOptions
-from calibrate.samplers.importance import IMPORTANCE
+from calibrate.samplers.importance import IMPORTANCE, _Run
 from calibrate.samplers.protocol import Context
 from emulator.core.errors import InputError, SolverError
 from emulator.surrogates.fem import fem_forward
@@ -235,6 +235,19 @@ def test_what_cannot_work_is_named():
     assert list(diagnose(draws, {}, row, {"weights_pareto_k": 0.5})) == []
     (sentence,) = diagnose(draws, {}, row, {"weights_pareto_k": 0.9})
     assert sentence.startswith("the weights of importance sampling have a heavy tail")
+
+
+def test_a_quarter_of_a_fit_is_where_the_fourth_root_of_the_density_is():
+    """Of a Gaussian of variance s the fourth root has variance 4 s, so a fit sees 1.75 s."""
+    run = _Run(density(lambda z: norm.logpdf(z, 1.0, 1.0).sum(), 2), {}, ImportanceOptions(), [0])
+    run.search()
+    points, taken = run.points.continued(60_000, np.random.default_rng(0)), []
+    run._go_to = lambda z, weights, *_: taken.append((z, weights))
+    run.fit(points.z, points.log_weights, points.log_posterior)
+    ((z, weights),) = taken
+    variance = 1.0 / (1.0 + SD**-2)
+    np.testing.assert_allclose(weights @ z, variance, atol=0.05)
+    np.testing.assert_allclose(weights @ (z - variance) ** 2, 1.75 * variance, rtol=0.05)
 
 
 def test_points_where_the_map_has_no_answer_are_left_out():
