@@ -18,7 +18,6 @@ from calibrate.certificate.evidence import (
 )
 from calibrate.posterior.box import in_words
 from calibrate.posterior.diagnosis import SMALLEST_P, closer_map, map_fault, sampling_faults
-from calibrate.posterior.taken_up import REMEDY
 from emulator.core.display import TableRepr
 
 Verdict = Literal["accepted", "reweight", "not certified", "undecided"]
@@ -168,7 +167,7 @@ def judge(evidence: Evidence) -> Certificate:
         where = where if evidence.mesh.homogeneous else "on this mesh"
         agreement = [(f"{agreement[0][0]} {where}", "")]
     findings = [*faults, *agreement, *mesh] if mesh_is_fine else [*faults, *mesh, *agreement]
-    findings += [(str(noise), REMEDY if noise.is_misfit else "") for noise in evidence.noise]
+    findings += [(str(noise), noise.remedy) for noise in evidence.noise]
     sentences = tuple(": ".join(filter(None, finding)) for finding in findings)
     return Certificate(verdict, findings[0][0], sentences, evidence)
 

@@ -14,6 +14,7 @@ from calibrate.statistical_model.predictive import noise_sds
 LARGEST_SHARE = 0.05  # of the signal, above which inferred noise is no longer a measurement's
 _OVER_SCATTER = 2.0  # inferred sd over the scatter of neighbouring data, above which it is misfit
 _OVER_PRIOR = 2.0  # inferred sd over the scale of its prior
+_EXACT = 1e-5  # of the signal, below which the noise is that of a computer's digits
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,21 @@ class TakenUp:
         """True where the noise is large and exceeds the scatter of neighbouring data."""
         large = self.sd > LARGEST_SHARE * self.signal or self.sd > _OVER_PRIOR * self.prior
         return large and self.sd > _OVER_SCATTER * self.scatter
+
+    @property
+    def remedy(self) -> str:
+        """What to do about noise that is a misfit, or too small for a measurement's; or nothing."""
+        if self.is_misfit:
+            return (
+                "the law misses the data by more than they scatter, and posterior sds say nothing "
+                "of that; try another law (calibrate compare), or fewer tests at once"
+            )
+        if self.sd < _EXACT * self.signal:
+            return (
+                "no measurement is that exact, and no forward map; give the noise of the test that "
+                f"the data stand for (--noise {self.name}=SD)"
+            )
+        return ""
 
     def __str__(self) -> str:
         """Return the noise as a share of the signal, and the scatter."""
@@ -73,11 +89,5 @@ def taken_up(model: Model, data: Data, draws: Mapping[str, np.ndarray]) -> Itera
 
 
 def sentences(noises: Iterator[TakenUp] | list[TakenUp]) -> list[str]:
-    """Return a sentence with a remedy for each noise that has taken up a misfit."""
-    return [f"{noise}: {REMEDY}" for noise in noises if noise.is_misfit]
-
-
-REMEDY = (
-    "the law misses the data by more than they scatter, and posterior sds say nothing of that; "
-    "try another law (calibrate compare), or fewer tests at once"
-)
+    """Return a sentence with a remedy for each noise that cannot be a measurement's."""
+    return [f"{noise}: {noise.remedy}" for noise in noises if noise.remedy]

@@ -324,8 +324,9 @@ def curvature(density: Density, data: Data, z: np.ndarray) -> tuple[np.ndarray, 
     precision = -0.5 * (hessian + hessian.T)
     if not np.isfinite(precision).all():
         return precision, np.nan, np.nan
-    smallest = float(np.linalg.eigvalsh(precision)[0])
-    if not smallest > 0.0:
-        return precision, smallest, np.nan
-    gradient = slope(z)
-    return precision, smallest, float(np.sqrt(gradient @ np.linalg.solve(precision, gradient)))
+    values, vectors = np.linalg.eigh(precision)
+    smallest = float(values[0])
+    # Of a precision that is singular but for round-off no eigenvalue below that says anything.
+    if not smallest > len(z) * np.finfo(float).eps * values[-1]:
+        return precision, min(smallest, 0.0), np.nan
+    return precision, smallest, float(np.linalg.norm(slope(z) @ vectors / np.sqrt(values)))

@@ -54,6 +54,17 @@ def test_a_law_that_bends_the_other_way_is_told_from_scatter(noise, sds):
     assert sentences([noisy]) == []
 
 
+def test_data_without_noise_are_said_to_have_none():
+    model = model_of(cal.GaussianNoise(sd_scale=0.5))
+    draws = {"mu": np.full(8, 10.0), "noise_sd": np.full(8, 1e-7)}
+    exact = model.predict({"mu": jnp.asarray(10.0)})[0]["stress"]
+    (line,) = sentences(taken_up(model, {"stress": exact}, draws))
+    assert line.endswith(
+        "no measurement is that exact, and no forward map; give the noise of the test that the "
+        "data stand for (--noise stress=SD)"
+    )
+
+
 def test_known_noise_takes_up_nothing():
     model = model_of(cal.GaussianNoise(sd=0.5))
     data = model.check_data(np.zeros((40, 1)))

@@ -16,6 +16,7 @@ from calibrate.samplers.modes import (
     MISSED_BY,
     MOST,
     climb_from,
+    curvature,
     explore,
     heavy,
     merged,
@@ -65,6 +66,17 @@ def test_a_climb_tells_the_width_and_the_mass_of_its_mode():
     assert mode.log_mass == pytest.approx(mass, abs=1e-8)
     np.testing.assert_allclose(mode.distances(mode.z + mode.root.T[:1]), 1.0)
     assert explore(density(jnp.sum, 2), {}, starts[:2]) == []
+
+
+def test_a_direction_that_is_flat_but_for_round_off_has_no_mode():
+    """Precisions 1e16 apart, as of data without noise, along turned axes, at some places."""
+    stiff = jnp.asarray([1e6, 1.7e6, -0.6e6])
+    of = density(lambda z: -0.5 * (stiff @ z) ** 2 - 1e-5 * z @ z, 3)
+    with np.errstate(all="raise"):
+        for place in 1e-3 * RNG.normal(size=(20, 3)):
+            smallest, distance = curvature(of, {}, place)[1:]
+            assert smallest <= 0.0
+            assert np.isnan(distance)
 
 
 def test_all_climb_where_there_are_several_modes():
