@@ -33,7 +33,7 @@ QUICK = {
     "inverse_benchmark": "--quick",
     "living_skin": "--data MEASURED/living_skin --quick",
     "mesh_row": "--quick",
-    "mesh_to_certificate": "--ventricles 1 --mesh 5 10 1",
+    "mesh_to_certificate": "--quick",
     "networks_alone": "--quick",
     "no_box": "--quick",
     "released_networks": "--quick --published PUBLISHED",

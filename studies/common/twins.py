@@ -33,3 +33,22 @@ def spread_nodes(scene: em.Scene, count: int, seed: int) -> np.ndarray:
     """Return ``count`` nodes with a free component, drawn without replacement, sorted."""
     free = np.flatnonzero(~scene.held.all(axis=1))
     return np.sort(np.random.default_rng(seed).choice(free, count, replace=False))
+
+
+def wide_theta(scene: em.Scene, rng: np.random.Generator) -> dict[str, float]:
+    """Return a draw of the wide prior by name.
+
+    A parameter above zero is log-normal, one sd or a factor of 2 to an end of its range, and 2 %
+    short of nature's end, as of Poisson's ratio; others fill their range.
+    """
+    drawn = {}
+    for k, parameter in enumerate(scene.parameters):
+        if parameter.low > 0.0:
+            width = max(0.5 * np.log(parameter.high / parameter.low), np.log(2.0))
+            value, end = np.inf, 0.98 * scene.quantities[parameter.name].high
+            while value >= end:
+                value = float(scene.centre[k] * np.exp(width * rng.normal()))
+            drawn[parameter.name] = value
+        else:
+            drawn[parameter.name] = float(rng.uniform(parameter.low, parameter.high))
+    return drawn

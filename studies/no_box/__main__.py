@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from studies.common.figures import pyplot
 from studies.common.output import Case, Results, parser
+from studies.common.twins import wide_theta
 
 import calibrate as cal
 import emulator as em
@@ -60,7 +61,6 @@ class Body:
     known: dict[str, float] = field(default_factory=dict)
 
 
-NATURE = {"nu": 0.49}  # where a truth ends
 BODIES = {
     "beam": Body("once_clamped_beam", "nodes:20", {"displacement": 0.2}),
     "twisting cube": Body("twisting_cube", "nodes:20", {"displacement": 0.05}),
@@ -74,22 +74,6 @@ BODIES = {
 }
 
 
-def truth_of(scene: em.Scene, number: int) -> dict[str, float]:
-    """A draw of the wide prior: log-normal, one sd or a factor of 2 to an end of the range."""
-    rng = np.random.default_rng([SEED, number])
-    drawn = {}
-    for k, parameter in enumerate(scene.parameters):
-        if parameter.low > 0.0:
-            width = max(0.5 * np.log(parameter.high / parameter.low), np.log(2.0))
-            value = np.inf
-            while value >= NATURE.get(parameter.name, np.inf):
-                value = float(scene.centre[k] * np.exp(width * rng.normal()))
-            drawn[parameter.name] = value
-        else:
-            drawn[parameter.name] = float(rng.uniform(parameter.low, parameter.high))
-    return drawn
-
-
 def one(name: str, number: int) -> dict[str, Any]:
     """One data set of the body called ``name``, to its verdict."""
     body, begin = BODIES[name], time.perf_counter()
@@ -101,7 +85,7 @@ def one(name: str, number: int) -> dict[str, Any]:
             em.write_mesh(file.with_suffix(".vtu"), mesh)
         scene = em.find_scene(body.scene or str(file))
         known = {parameter.split("@")[0] for parameter in body.known}
-        drawn = truth_of(scene, number)
+        drawn = wide_theta(scene, np.random.default_rng([SEED, number]))
         truth = {n: value for n, value in drawn.items() if n not in known}
         ranges = {p.name: (p.low, p.high) for p in scene.parameters}
         outside = sorted(n for n, v in truth.items() if not ranges[n][0] <= v <= ranges[n][1])

@@ -11,6 +11,7 @@ FAMILIES = (
     "nearly incompressible",
     "corners of the boxes",
     "twice outside the boxes",
+    "wide priors",
     "ventricles",
     "exponentials",
     "twists",

@@ -1,4 +1,4 @@
-"""Corners of every built-in scene's parameter box, and twice outside it."""
+"""Corners of every built-in scene's parameter box, twice outside it, and draws of wide priors."""
 
 from __future__ import annotations
 
@@ -7,9 +7,12 @@ from functools import cache, partial
 
 import jax.numpy as jnp
 import numpy as np
+from studies.common.twins import wide_theta
 from studies.stability.solver.case import CASES, SEED, Case
 
 import emulator as em
+
+DRAWS = 60  # of the wide prior of each scene
 
 
 @cache
@@ -33,6 +36,12 @@ def _corner(name: str, corner: tuple[int, ...], stretch: float) -> Case:
     return Case(scene, np.asarray(scene.from_unit(jnp.asarray(position))))
 
 
+def _drawn(name: str, number: int) -> Case:
+    scene = built_in(name)
+    drawn = wide_theta(scene, np.random.default_rng([SEED, number]))
+    return Case(scene, np.array([drawn[parameter] for parameter in scene.parameter_names]))
+
+
 for _name in em.scenes.BUILT_IN:
     for _bits in corners(len(em.scenes.BUILT_IN[_name](order=1).parameters)):
         _label = f"{_name}_" + "".join("lh"[bit] for bit in _bits)
@@ -41,3 +50,5 @@ for _name in em.scenes.BUILT_IN:
             "twice outside the boxes",
             partial(_corner, _name, _bits, 2.0),
         )
+    for _number in range(DRAWS):
+        CASES[f"{_name}_wide_{_number}"] = ("wide priors", partial(_drawn, _name, _number))
