@@ -20,7 +20,8 @@ from calibrate.state_names import split
 from calibrate.statistical_model.load_states import LoadStates, load_states
 from emulator.core.errors import InputError
 from emulator.mechanics.laws.law import law_identity
-from emulator.scenes.forward_problem import ForwardProblem
+from emulator.scenes.forward_problem import ForwardProblem, directions_read
+from emulator.scenes.tissue import effective_angles
 from emulator.surrogates.protocol import ForwardMap
 
 _BULK = "kappa"  # the parameter of compressible laws that an incompressible specimen has no use for
@@ -82,6 +83,33 @@ class Transfer:
     states: LoadStates
     draws: Mapping[str, np.ndarray]
     sources: Mapping[str, str]
+
+
+def made_of[P: ForwardProblem](scene: P, tissue: ForwardProblem) -> P:
+    """Return ``scene`` of another tissue: of its law, with the law's parameters and constants.
+
+    What belongs to loads and supports stays, and so does a bulk modulus that both laws have.
+    Directions that nothing reads any more are left out.
+
+    :class:`InputError` where the law needs fibres or sheets and the scene has none.
+    """
+    law, before = tissue.law, set(scene.law.parameters)
+    gone = before - ({_BULK} & set(law.parameters))
+    constants = {name: v for name, v in tissue.constants.items() if name in law.parameters}
+    constants |= {name: v for name, v in scene.constants.items() if name not in gone}
+    parameters = (
+        *(p for p in tissue.parameters if p.name in law.parameters and p.name not in constants),
+        *(p for p in scene.parameters if p.name not in before),
+    )
+    read = directions_read(law, getattr(scene, "loads", ()))
+    changes: dict[str, Any] = {
+        kind: None if reader is None else getattr(scene, kind) for kind, reader in read.items()
+    }
+    changes["angles"] = effective_angles(scene.angles, changes["fibres"], changes["sheets"])
+    other = replace(
+        cast(Any, scene), law=law, parameters=parameters, constants=constants, origin={}, **changes
+    )
+    return cast(P, other)
 
 
 def transfer(

@@ -17,20 +17,32 @@ from emulator.core.store import check_folder, read_json
 if TYPE_CHECKING:
     import jax
 
+    from calibrate.prediction import Learned
+    from calibrate.prediction.several import Weights
     from emulator.accuracy.estimate import ErrorEstimate
     from emulator.scenes import Scene
 
+_OF_MEMBERS = "of members, see calibrate report"
 _ROWS = 24  # numbers of a prediction that a table shows
-_OF_POSTERIOR = ("observe", "draws", "most_runs", "load_steps", "seed")  # options beside --scene
+_OF_POSTERIOR = ("observe", "weights", "draws", "most_runs", "load_steps", "seed")
+"""Options beside --scene."""
 
 
 @command(
-    option("emulator", "EMULATOR|RUN", "shipped name or folder; with --scene, of calibrate infer"),
+    option(
+        "emulator",
+        "EMULATOR|RUN",
+        "shipped name or folder; with --scene, of calibrate infer, or several of the same data by "
+        "other laws",
+        nargs="+",
+    ),
     words.THETA,
     flag("--error-bar", "estimate the error from the residual forces"),
     option("--scene", "OTHER", "what the draws of RUN predict of this scene or specimen, of the "
            "same law: another body, load or test; --theta has its loads, pressure@p1=0.5"),
     option("--observe", "WORDS", "of OTHER, as of infer: volume, landmarks:24, ..."),
+    option("--weights", "KIND", "of several RUNs: stacking, which predicts best what was left out "
+           "(default), evidence or equal", choices=["stacking", "evidence", "equal"]),
     option("--draws", "N", "of RUN (default 1000)", type=int),
     option("--most-runs", "N", "FEM runs of OTHER at most (default 96)", type=int),
     option("--load-steps", "N", "of FEM of OTHER (default 1)", type=int),
@@ -51,22 +63,23 @@ def predict(arguments: Namespace) -> Answer:
     for name in _OF_POSTERIOR:
         if getattr(arguments, name) is not None:
             raise InputError(f"--{name.replace('_', '-')} has no effect without --scene")
-    if (Path(arguments.emulator) / "run.json").is_file():
+    if len(arguments.emulator) > 1:
+        raise InputError("predict: several folders are of posteriors: name a scene, --scene")
+    if (Path(arguments.emulator[0]) / "run.json").is_file():
         raise InputError(
-            f"{arguments.emulator} is a folder of infer: name the scene that it predicts, --scene"
+            f"{arguments.emulator[0]} is a folder of infer: name the scene that it predicts, "
+            "--scene"
         )
     return _at_one_theta(arguments)
 
 
 def _on_another_scene(arguments: Namespace) -> Answer:
-    """Predict another scene by the draws of a posterior."""
+    """Predict another scene by the draws of a posterior, or of several laws'."""
     from calibrate.measurements import parse_observation
     from calibrate.prediction import output, predict_on
     from calibrate.prediction.beyond import reaches
-    from calibrate.prediction.transfer import Learned
-    from calibrate.project import holds_population, read_posterior
-    from calibrate.project.calibration import NOT_CERTIFIED
-    from calibrate.project.results import CERTIFICATE
+    from calibrate.prediction.several import mixture, table_of
+    from calibrate.prediction.transfer import made_of
     from calibrate.state_names import split
     from emulator.catalogue import find_problem
 
@@ -75,33 +88,72 @@ def _on_another_scene(arguments: Namespace) -> Answer:
     if arguments.observe is None:
         raise InputError("--scene: say what to predict with --observe, e.g. --observe volume")
     folder = None if arguments.out is None else check_folder(arguments.out)
-    run, verdict = Path(arguments.emulator), "of members, see calibrate report"
-    if holds_population(run):
-        learned = Learned.of_population(run)
-    else:
-        learned = Learned.of(read_posterior(run)[1])
-        file = run / CERTIFICATE
-        verdict = read_json(file)["verdict"] if file.is_file() else NOT_CERTIFIED
+    runs, several = list(dict.fromkeys(arguments.emulator)), len(arguments.emulator) > 1
+    if len(runs) < len(arguments.emulator):
+        raise InputError("predict: a folder is given twice; give each posterior once")
+    if arguments.weights is not None and not several:
+        raise InputError("--weights are of several posteriors; one has all the weight")
+    bodies, verdicts, weights = _learned(runs)
     scene, known = find_problem(arguments.scene), words.assignments(arguments.theta)
     states = tuple(dict.fromkeys(state for _, state in map(split, known) if state)) or ("",)
     seed = 0 if arguments.seed is None else arguments.seed
-    observe = parse_observation(scene, arguments.observe, seed, states)
     options = {
         name: value
         for name in ("draws", "most_runs", "load_steps")
         if (value := getattr(arguments, name)) is not None
     }
-    progress = not arguments.json
-    predicted = predict_on(
-        learned, scene, observe, known=known, seed=seed, progress=progress, **options
+    predictions = {}
+    for name, learned in bodies.items():
+        of_law = made_of(scene, learned.scene) if several else scene
+        observe = parse_observation(of_law, arguments.observe, seed, states)
+        predictions[name] = predict_on(
+            learned, of_law, observe, known=known, seed=seed, progress=not arguments.json, **options
+        )
+    chosen, predicted = runs[0], predictions[runs[0]]
+    result: dict[str, Any] = {"posterior": verdicts[chosen]}
+    if weights is not None:
+        shares = weights.by(arguments.weights or "stacking")
+        chosen, predicted = max(shares, key=lambda n: shares[n]), mixture(predictions, shares, seed)
+        predicted.warnings.extend(weights.warnings)
+        laws = {name: learned.scene.law.name for name, learned in bodies.items()}
+        result = {"posterior": verdicts, "laws": table_of(weights, laws)}
+    reach = reaches(
+        bodies[chosen],
+        predicted.scene,
+        predicted.forward,
+        predicted.observe.states,
+        predicted.thetas,
     )
-    reach = reaches(learned, predicted.scene, predicted.forward, observe.states, predicted.thetas)
-    result = {"posterior": verdict, **output.as_json(predicted, reach)}
+    result |= output.as_json(predicted, reach)
+    if several:
+        result["by_law"] = {name: dict(output.numbers(p)) for name, p in predictions.items()}
     text = bands_summary(result)
     if folder is not None:
         result["files"] = output.write(predicted, result, folder)
         text += f"\nwritten to {folder}: {', '.join(result['files'])}"
     return Answer(result, text, not predicted.warnings)
+
+
+def _learned(runs: list[str]) -> tuple[dict[str, Learned], dict[str, str], Weights | None]:
+    """Return what each run has learned, its verdict, and the weights of several."""
+    from calibrate.prediction.several import weights_of
+    from calibrate.prediction.transfer import Learned
+    from calibrate.project import holds_population, read_posterior
+    from calibrate.project.calibration import NOT_CERTIFIED
+    from calibrate.project.results import CERTIFICATE
+
+    bodies, verdicts, trees = {}, {}, {}
+    for run in runs:
+        if holds_population(run):
+            if len(runs) > 1:
+                raise InputError(f"{run} is a population; several laws are of one body each")
+            bodies[run], verdicts[run] = Learned.of_population(run), _OF_MEMBERS
+            continue
+        posterior = read_posterior(run)[1]
+        bodies[run], trees[run] = Learned.of(posterior), posterior.tree
+        file = Path(run) / CERTIFICATE
+        verdicts[run] = read_json(file)["verdict"] if file.is_file() else NOT_CERTIFIED
+    return bodies, verdicts, weights_of(trees) if len(runs) > 1 else None
 
 
 def bands_summary(result: dict[str, Any]) -> str:
@@ -118,7 +170,7 @@ def bands_summary(result: dict[str, Any]) -> str:
     for name, source in result["sources"].items():
         by_source.setdefault(source, []).append(name)
     lines += [f"{', '.join(names)}: {source}" for source, names in by_source.items()]
-    lines.append(f"verdict on the posterior: {result['posterior']}")
+    lines += _laws_summary(result)
     others = (
         f"{result['fem_runs']} of them by FEM; others are those of a process, which missed tests "
         f"by {result['missed_sd']:.2g} sd of the draws"
@@ -127,6 +179,26 @@ def bands_summary(result: dict[str, Any]) -> str:
     lines.append(f"{result['draws']} draws, {'each of them solved' if every else others}")
     lines += [str(Reach(**one)) for one in result["beyond"] if one["share"] > 0.0]
     return "\n".join([*lines, *result["warnings"]])
+
+
+def _laws_summary(result: dict[str, Any]) -> list[str]:
+    """Return the verdict on a posterior, or a table of several laws and what each predicts."""
+    if "laws" not in result:
+        return [f"verdict on the posterior: {result['posterior']}"]
+    rows = [
+        [row["law"], row["posterior"], row["stacking"], row["evidence"],
+         result["posterior"][row["posterior"]]]
+        for row in result["laws"]
+    ]  # fmt: skip
+    lines = [table(("law", "posterior", "stacking", "evidence", "verdict"), rows)]
+    for name in list(result["numbers"])[:_ROWS]:
+        bands = (
+            f"{row['law']} {numbers[name]['low']:.4g} to {numbers[name]['high']:.4g}"
+            for row in result["laws"]
+            for numbers in [result["by_law"][row["posterior"]]]
+        )
+        lines.append(f"{name}: {', '.join(bands)}")
+    return lines
 
 
 def _at_one_theta(arguments: Namespace) -> Answer:
@@ -140,7 +212,8 @@ def _at_one_theta(arguments: Namespace) -> Answer:
 
     if arguments.out:
         words.check_vtu(arguments.out)
-    emulator = load(arguments.emulator)
+    (name,) = arguments.emulator
+    emulator = load(name)
     scene, forward = emulator.scene, emulator.cache()
     values = words.assignments(arguments.theta)
     theta = _anywhere(scene, values) if values else scene.centre
@@ -155,7 +228,7 @@ def _at_one_theta(arguments: Namespace) -> Answer:
     finite = bool(against.finite)
     error_of = None if estimate is None or not estimate.valid else estimate.of
     result: dict[str, Any] = {
-        "emulator": arguments.emulator,
+        "emulator": name,
         "scene": scene.name,
         "theta": by_name(scene, theta),
         "trusted": bool(against.trusted),
