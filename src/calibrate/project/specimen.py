@@ -41,6 +41,7 @@ _GRIPS = (
     "# marks = 2.0   # mm, side of the square in which stretches were measured; not of the grips",
 )
 _Sizes = dict[str, tuple[SpecimenCurves, np.ndarray]]  # each measurement, and its data (m, c)
+_NARROW = 0.7  # of the stretch around a tube's inside without pressure: the sector is another
 _DRIFT = 0.05  # share of the largest number by which it may change while the motion is held
 
 
@@ -120,10 +121,17 @@ def _notes(
     """Return one sentence per value that was read or guessed; ``of_law`` is the one on the law."""
     part, _ = next(iter(measured.values()))
     axes = ["stretch_around", "stretch_axial"] if tube else [f"stretch_{a}" for a in AXES]
-    motions = zip(axes, part.stretches.T, strict=False)
+    motions = list(zip(axes, part.stretches.T, strict=False))
     notes = [
         f"{len(part.states.free)} states in {_tests(part.states)}",
-        *(f"{n} from {x.min():.4g} to {x.max():.4g}" for n, x in motions if np.ptp(x) > 0.0),
+        *(
+            f"{n} from {x.min():.4g} to {x.max():.4g}"
+            if np.ptp(x) > 0.0
+            else f"{n} is {x[0]:.4g} in each state, taken as prescribed"
+            for n, x in motions
+            if not np.isnan(x).any()
+        ),
+        *(() if tube is None else _of_tube(part.stretches, measured)),
         *(
             f"{name} reaches {_farthest(data, part.at_rest):.3g} {part.unit}".removesuffix(" 1")
             for name, (part, data) in measured.items()
@@ -148,6 +156,25 @@ def _notes(
     if cells.unloading:
         notes.insert(1, f"{cells.unloading} rows of unloading are left out")
     return notes
+
+
+def _of_tube(stretches: np.ndarray, measured: _Sizes) -> Iterator[str]:
+    """Ask about what a tube under pressure is not, and say what its table cannot tell.
+
+    stretches : around and along the tube, inside, (m, 3).
+    """
+    around, along, _ = stretches.T
+    if (around * np.sqrt(along)).min() < _NARROW:
+        yield (
+            f"CHANGE: the inside is {around.min():.2g} times as long around as in the sector, "
+            "shorter than a tube's under pressure: are the unit of the radii, inner_radius and "
+            "opening_angle of [tube] right (an angle makes stretches larger)?"
+        )
+    if np.ptp(along) == 0.0 and TubeForce.name not in measured:
+        yield (
+            "CHANGE: one axial stretch and no force_axial: pressures alone hardly tell the "
+            "stiffness along the tube from that around it"
+        )
 
 
 def _farthest(data: np.ndarray, at_rest: float) -> float:
