@@ -13,17 +13,25 @@ from calibrate.measurements.specimens import SpecimenCurves
 from calibrate.measurements.stress import is_stress
 from calibrate.measurements.stretch import Stretch
 from calibrate.measurements.tube import TubeForce, TubePressure
-from emulator.core.cells import Cells, read_cells
+from emulator.core.cells import BRANCH, PROTOCOL, Cells, read_cells
 from emulator.core.errors import InputError
-from emulator.core.units import with_unit
+from emulator.core.units import KPA_PER_MMHG, with_unit
 from emulator.mechanics.laws import Law, find_law
 from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.draft import prior_lines
 from emulator.scenes.file import read_scene
+from emulator.scenes.forward_problem import ForwardProblem
 from emulator.scenes.parameter_space import Parameter
-from emulator.specimens.specimen import Specimen, read_states, require_specimen, specimen
-from emulator.specimens.states import AXES, States, pull_columns
+from emulator.specimens.specimen import (
+    Specimen,
+    likely_names,
+    read_states,
+    require_specimen,
+    specimen,
+)
+from emulator.specimens.states import AXES, States, motion_columns, pull_columns
 from emulator.specimens.tube import Tube
+from emulator.specimens.tube import motion_columns as tube_columns
 
 _MODULI = (0.005, 3.0)  # range of a modulus, as a share of the largest stress over its strain
 _EXPONENTS = (0.1, 50.0)
@@ -41,6 +49,8 @@ _GRIPS = (
     "# marks = 2.0   # mm, side of the square in which stretches were measured; not of the grips",
 )
 _Sizes = dict[str, tuple[SpecimenCurves, np.ndarray]]  # each measurement, and its data (m, c)
+_MANY, _MINUTES = 500, 1.0 / 180.0  # states worth a word, and what each takes on one core
+_HIGH = 40.0  # kPa, 300 mmHg: a pressure without a unit that is higher may be in mmHg
 _NARROW = 0.7  # of the stretch around a tube's inside without pressure: the sector is another
 _DRIFT = 0.05  # share of the largest number by which it may change while the motion is held
 
@@ -131,12 +141,13 @@ def _notes(
             for n, x in motions
             if not np.isnan(x).any()
         ),
-        *(() if tube is None else _of_tube(part.stretches, measured)),
+        *(() if tube is None else _of_tube(part.stretches, measured, cells.words)),
         *(
             f"{name} reaches {_farthest(data, part.at_rest):.3g} {part.unit}".removesuffix(" 1")
             for name, (part, data) in measured.items()
         ),
         *_drifts(list(cells.rows), part.states, measured),
+        *long_table(part.scene),
         of_law,
         f"priors of moduli follow from a stiffness of {slope:.3g} kPa",
         *([] if tube else ['grips = "none": stresses are taken to be even']),
@@ -153,15 +164,21 @@ def _notes(
     stresses = [w for w, (n, _) in names.items() if is_stress(w) or w in pulls or n in of_tube]
     if bare := [w for w in stresses if not names[w][1]]:
         notes.insert(1, f"{', '.join(bare)} without a unit: kPa, forces mN; others in brackets")
+    moving = motion_columns(names) if tube is None else tube_columns(names)
+    used = (*moving, *stresses, PROTOCOL, BRANCH, *(w for w in names if w.startswith("area_")))
+    if ignored := [word for word in names if word and word not in used]:
+        likely = likely_names(ignored, of_tube=tube is not None)
+        notes.insert(1, f"columns left out: {', '.join(ignored)}{likely}")
     if cells.unloading:
         notes.insert(1, f"{cells.unloading} rows of unloading are left out")
     return notes
 
 
-def _of_tube(stretches: np.ndarray, measured: _Sizes) -> Iterator[str]:
+def _of_tube(stretches: np.ndarray, measured: _Sizes, words: Sequence[str]) -> Iterator[str]:
     """Ask about what a tube under pressure is not, and say what its table cannot tell.
 
     stretches : around and along the tube, inside, (m, 3).
+    words : the columns of the table.
     """
     around, along, _ = stretches.T
     if (around * np.sqrt(along)).min() < _NARROW:
@@ -170,10 +187,26 @@ def _of_tube(stretches: np.ndarray, measured: _Sizes) -> Iterator[str]:
             "shorter than a tube's under pressure: are the unit of the radii, inner_radius and "
             "opening_angle of [tube] right (an angle makes stretches larger)?"
         )
+    if TubePressure.column in words and (most := np.nanmax(measured[TubePressure.name][1])) > _HIGH:
+        yield (
+            f"CHANGE: a pressure of {most:.3g} without a unit is taken for kPa, "
+            f"{most / KPA_PER_MMHG:.0f} mmHg: call it 'pressure [mmHg]' if it is in mmHg"
+        )
     if np.ptp(along) == 0.0 and TubeForce.name not in measured:
         yield (
             "CHANGE: one axial stretch and no force_axial: pressures alone hardly tell the "
             "stiffness along the tube from that around it"
+        )
+
+
+def long_table(scene: ForwardProblem) -> Iterator[str]:
+    """Say how long an inference takes, where a specimen has many states."""
+    count = len(scene.states.free) if isinstance(scene, Specimen) else 0
+    if count > _MANY:
+        yield (
+            f"{count} states take some {1.0 + _MINUTES * count:.0f} minutes to sample and certify, "
+            f"in proportion: a table of the means of {round(2 * count / _MANY)} neighbouring rows "
+            "tells a smooth curve as well"
         )
 
 

@@ -24,10 +24,10 @@ OTHER_SPREADSHEETS = (".xls", ".ods")
 """Endings of spreadsheets that are not read."""
 PROTOCOL, BRANCH = "protocol", "branch"
 """Columns of the test that a row belongs to, and of whether it was loading."""
-UNLOADING = "unloading"
-"""The word in the column ``branch`` of rows that are left out."""
+LOADING, UNLOADING = "loading", "unloading"
+"""The words in the column ``branch`` of rows that are data, and of those that are left out."""
 _DIMENSIONLESS = ("-", "1", "mm/mm")
-_THOUSANDS = re.compile(r"[-+]?\d{1,3}(,\d{3})+(\.\d*)?")
+_THOUSANDS = re.compile(r"[-+]?\d{1,3}([., ']\d{3})+([.,]\d*)?")
 _MARKED = re.compile(r"[-+]?\d+([.,])\d+")
 MISSING = ("", "na", "n/a", "nan", "#n/a", "-", "--")
 
@@ -86,6 +86,11 @@ def read_cells(path: Path) -> Cells:
         raise InputError(
             f"data file {path}: its first line, '{first}', has no names "
             "of columns; put them above it, e.g. node,ux,uy,uz"
+        )
+    if cells and len(words) == 1 and all(len(row[0].split()) > 1 for row in (words, *cells)):
+        raise InputError(
+            f"data file {path}: its columns, '{words[0][:40]}', are separated by blanks: put "
+            "commas, semicolons or tabs between them"
         )
     while words and not words[-1] and not any("".join(row[len(words) - 1 :]) for row in cells):
         words = words[:-1]  # as spreadsheets export them

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from calibrate.cli import main
 from calibrate.measurements.data import read_measurements
+from calibrate.project import calibration
 from calibrate.project.specimen import draft_specimen
 from emulator.core.cells import read_cells
 from emulator.core.errors import InputError
@@ -245,6 +247,27 @@ def test_a_dense_table_has_no_holds(tmp_path):
     stress = 30.0 * (stretch - 1.0) + np.random.default_rng(0).normal(size=1600)
     notes = draft(tmp_path, "stretch_x,stress_x", stretch, stress).notes
     assert not any("hold one state" in note for note in notes)
+    (said,) = [note for note in notes if "minutes" in note]
+    assert said.startswith("1600 states take some 10 minutes to sample and certify, in proportion")
+    assert "the means of 6 neighbouring rows" in said
+    (tmp_path / "few").mkdir()
+    few = draft(tmp_path / "few", "stretch_x,stress_x", stretch[::8], stress[::8]).notes
+    assert not any("minutes" in note for note in few)
+
+
+def test_inference_of_a_long_table_says_how_long_it_takes_before_it_begins(
+    tmp_path, capsys, monkeypatch
+):
+    def no_sampling(*arguments, **options):
+        raise InputError("sampling begins")
+
+    monkeypatch.setattr(calibration, "sample", no_sampling)
+    stretch = np.linspace(1.0, 1.3, 600)
+    draft(tmp_path, "stretch_x,stress_x", stretch, 30.0 * (stretch - 1.0))
+    assert main(["infer", str(tmp_path / "x.toml"), "--out", str(tmp_path / "run")]) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert said[-2].startswith("600 states take some 4 minutes to sample and certify")
+    assert "sampling begins" in said[-1]
 
 
 def test_a_tube_s_axial_stretch_is_said_and_what_no_tube_under_pressure_is_is_asked(tmp_path):
@@ -361,3 +384,52 @@ def test_two_tests_in_one_table_and_sweeps_of_a_load_get_their_own_words(tmp_pat
     cycle = np.concatenate([STRETCH, [1.1, 1.05, 1.0], STRETCH])
     told = refusal(tmp_path, "stretch_x,stress_x", cycle, cycle - 1.0)
     assert "unloading goes under 'unloading'" in told
+
+
+@pytest.mark.parametrize("unit", ["kN/m2", "KN/m^2", "kpa"])
+def test_kilopascals_have_many_names(tmp_path, unit):
+    notes = draft(tmp_path, f"stretch_x,stress_x [{unit}]", STRETCH, STRESS).notes
+    assert f"stress reaches {STRESS[-1]:.3g} kPa" in notes
+
+
+def test_columns_that_are_left_out_are_named(tmp_path):
+    time, true = np.arange(30), STRESS * STRETCH
+    columns = "time [s],stretch_x,stress_x [kPa],true_stress [kPa]"
+    (said,) = [
+        n for n in draft(tmp_path, columns, time, STRETCH, STRESS, true).notes if "left" in n
+    ]
+    assert said == (
+        "columns left out: time [s], true_stress [kPa]; call true_stress [kPa] cauchy_x [kPa] if "
+        "they are that"
+    )
+    for file in tmp_path.glob("*.toml"):
+        file.unlink()
+    told = refusal(tmp_path, "Stretch,Stress (MPa)", STRETCH, STRESS)
+    assert "call Stretch stretch_x, Stress (MPa) stress_x [MPa] if they are that" in told
+
+
+def test_words_of_branches_blanks_and_marks_of_thousands_that_are_none(tmp_path):
+    branches = ["load"] * 15 + ["unload"] * 15
+    told = refusal(tmp_path, "branch,stretch_x,stress_x", branches, STRETCH, STRESS)
+    assert "column 'branch' is 'load'; give 'loading', or 'unloading' for rows" in told
+    for text, line in (
+        ("stretch_x stress_x\n1.0 0\n1.1 3\n", "are separated by blanks: put commas"),
+        ("stretch_x;stress_x [Pa]\n1;0\n1,1;1.004,9\n", "leave out marks of thousands"),
+    ):
+        (tmp_path / "t.csv").write_text(text)
+        with pytest.raises(InputError, match=line):
+            draft_specimen(tmp_path / "t.csv", tmp_path / "x.toml")
+
+
+def test_a_pressure_that_may_be_in_mmhg_is_asked_about(tmp_path):
+    radius, pressure = np.linspace(0.4, 0.5, 30), np.linspace(0.0, 150.0, 30)
+    asked = []
+    for unit in ("", " [mmHg]"):
+        words = f"inner_radius [mm],stretch_axial,pressure{unit}"
+        columns = radius, np.full(30, 1.2), pressure
+        asked += [n for n in draft(tmp_path, words, *columns, tube=Tube(0.36, (0.1,))).notes
+                  if "'pressure [mmHg]'" in n]  # fmt: skip
+        for file in tmp_path.glob("*.toml"):
+            file.unlink()
+    (said,) = asked
+    assert "a pressure of 150 without a unit is taken for kPa, 1125 mmHg" in said
