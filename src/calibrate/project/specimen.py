@@ -158,20 +158,24 @@ def _notes(
             for name, (part, _) in measured.items()
         ),
     ]
-    of_tube = (TubePressure.column, TubeForce.column)
+    notes[1:1] = _of_columns(cells, tube)
+    return notes
+
+
+def _of_columns(cells: Cells, tube: Tube | None) -> Iterator[str]:
+    """Say which rows and columns are left out, and which have no unit."""
+    if cells.unloading:
+        yield f"{cells.unloading} rows of unloading are left out"
     names = {word: with_unit(word) for word in cells.words}
-    pulls = pull_columns(names).values()
-    stresses = [w for w, (n, _) in names.items() if is_stress(w) or w in pulls or n in of_tube]
-    if bare := [w for w in stresses if not names[w][1]]:
-        notes.insert(1, f"{', '.join(bare)} without a unit: kPa, forces mN; others in brackets")
     moving = motion_columns(names) if tube is None else tube_columns(names)
+    pulls, of_tube = pull_columns(names).values(), (TubePressure.column, TubeForce.column)
+    stresses = [w for w, (n, _) in names.items() if is_stress(w) or w in pulls or n in of_tube]
     used = (*moving, *stresses, PROTOCOL, BRANCH, *(w for w in names if w.startswith("area_")))
     if ignored := [word for word in names if word and word not in used]:
         likely = likely_names(ignored, of_tube=tube is not None)
-        notes.insert(1, f"columns left out: {', '.join(ignored)}{likely}")
-    if cells.unloading:
-        notes.insert(1, f"{cells.unloading} rows of unloading are left out")
-    return notes
+        yield f"columns left out: {', '.join(ignored)}{likely}"
+    if bare := [w for w in stresses if not names[w][1]]:
+        yield f"{', '.join(bare)} without a unit: kPa, forces mN; others in brackets"
 
 
 def _of_tube(stretches: np.ndarray, measured: _Sizes, words: Sequence[str]) -> Iterator[str]:

@@ -87,11 +87,6 @@ def read_cells(path: Path) -> Cells:
             f"data file {path}: its first line, '{first}', has no names "
             "of columns; put them above it, e.g. node,ux,uy,uz"
         )
-    if cells and len(words) == 1 and all(len(row[0].split()) > 1 for row in (words, *cells)):
-        raise InputError(
-            f"data file {path}: its columns, '{words[0][:40]}', are separated by blanks: put "
-            "commas, semicolons or tabs between them"
-        )
     while words and not words[-1] and not any("".join(row[len(words) - 1 :]) for row in cells):
         words = words[:-1]  # as spreadsheets export them
     while cells and not any(cells[-1]):
@@ -192,6 +187,11 @@ def _of_text(path: Path) -> Raw:
         words, *cells = [[cell.strip() for cell in row] for row in table] or [[]]
     except csv.Error as error:
         raise InputError(f"data file {path} is not a CSV file: {error}") from error
+    if cells and len(words) == 1 and all(len(row[0].split()) > 1 for row in (words, *cells)):
+        raise InputError(
+            f"data file {path}: its columns, '{words[0][:40]}', are separated by blanks: put "
+            "commas, semicolons or tabs between them"
+        )
     return words, cells, delimiter != ","
 
 
