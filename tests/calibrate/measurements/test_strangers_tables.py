@@ -247,6 +247,10 @@ def test_a_dense_table_has_no_holds(tmp_path):
     stress = 30.0 * (stretch - 1.0) + np.random.default_rng(0).normal(size=1600)
     notes = draft(tmp_path, "stretch_x,stress_x", stretch, stress).notes
     assert not any("hold one state" in note for note in notes)
+    (tmp_path / "read").mkdir()  # to three digits, of a small pull
+    pulls = np.round(1.0 + np.linspace(0.0, 0.02, 60), 3)
+    read = draft(tmp_path / "read", "stretch_x,stress_x", pulls, np.linspace(0.0, 5.0, 60)).notes
+    assert not any("hold one state" in note for note in read)
     (said,) = [note for note in notes if "minutes" in note]
     assert said.startswith("1600 states take some 10 minutes to sample and certify, in proportion")
     assert "the means of 6 neighbouring rows" in said
@@ -281,15 +285,16 @@ def test_a_tube_s_axial_stretch_is_said_and_what_no_tube_under_pressure_is_is_as
 
     held = np.full(30, 1.2), STRESS
     told = notes(1.0, *held)
-    assert "stretch_axial is 1.2 in each state, taken as prescribed" in told
+    assert "stretch_axial is 1.2 wherever it is prescribed" in told
     assert "one axial stretch and no force_axial" in told
-    assert "shorter than" not in told
+    assert "no artery" not in told
     assert "no force_axial" not in notes(1.0, *held, STRESS, more=",force_axial")
     assert "no force_axial" not in notes(1.0, np.linspace(1.0, 1.2, 30), STRESS)
     told = notes(0.3, *held)
-    assert "CHANGE: the inside is 0.36 times as long around as in the sector, shorter" in told
+    assert "CHANGE: the inside is 0.36 to 0.44 times as long around as in the sector, which" in told
+    assert "which no artery" in notes(5.0, *held)
     # A stretched tube without pressure is thinner, and that is right.
-    assert "shorter than" not in notes(0.75, np.full(30, 1.6), STRESS)
+    assert "no artery" not in notes(0.75, np.full(30, 1.6), STRESS)
 
 
 @pytest.mark.parametrize(
@@ -433,3 +438,12 @@ def test_a_pressure_that_may_be_in_mmhg_is_asked_about(tmp_path):
             file.unlink()
     (said,) = asked
     assert "a pressure of 150 without a unit is taken for kPa, 1125 mmHg" in said
+
+
+def test_a_stretch_of_some_tests_is_said(tmp_path):
+    """A pull whose shear is 0, and a shear without stretches, as shear_from_zero has them."""
+    tests, shear = ["pull"] * 30 + ["shear"] * 30, np.append(np.zeros(30), 2.0 * (STRETCH - 1.0))
+    columns = [*STRETCH, *HALF], shear, [*STRESS, *HALF], [*HALF, *(3.0 * shear[30:])]
+    header = "protocol,stretch_x,shear_xy,stress_x,stress_xy"
+    notes = draft(tmp_path, header, tests, *columns).notes
+    assert "stretch_x from 1 to 1.2" in notes
