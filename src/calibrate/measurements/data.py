@@ -13,9 +13,9 @@ For a body in several load states, a CSV file has a column ``state`` with the st
 row, and a netCDF file variables such as ``volume@diastole``.
 
 A parameter that is known exactly in a load state, such as the amount of a motion, is a column
-``known:NAME``, the same number in every row of the state or given once. A CSV file
-with such columns and neither ``state`` nor places is a loading curve: each row is a load state,
-named by its number.
+``known:NAME``, or ``NAME`` where it is a load's, the same number in every row of the state or given
+once. A CSV file with such columns and neither ``state`` nor places is a loading curve: each row is
+a load state, named by its number.
 
 Each kind of observation (``calibrate.measurements.OBSERVATIONS``) names its own columns and
 variables.
@@ -85,9 +85,9 @@ def read_measurements(
         of_cells = file.suffix.lower() in (*TEXT, *SPREADSHEETS, *OTHER_SPREADSHEETS)
         by_state: Mapping[str, DataTable]
         if table is not None and table.path.samefile(file):
-            by_state = read_csv(table._replace(path=file))
+            by_state = read_csv(table._replace(path=file), scene.load_parameters)
         else:
-            by_state = read_csv(file) if of_cells else read_netcdf(file)
+            by_state = read_csv(file, scene.load_parameters) if of_cells else read_netcdf(file)
         for inner, content in by_state.items():
             state = ".".join(filter(None, (prefix, inner)))
             known |= {in_state(name, state): value for name, value in content.known.items()}
@@ -133,7 +133,9 @@ def _read(
         return kind.read(scene, layout, arrays)
     part, number = parse(kind, scene, name)[1], arrays[name]
     if number.size != 1:
-        raise InputError(f"{name} has {number.size} values; give one, in {part.unit}")
+        curve = "; rows of a loading curve have" if scene.load_parameters else ""
+        curve += " or".join(f" a column '{load}'" for load in scene.load_parameters)
+        raise InputError(f"{name} has {number.size} values; give one, in {part.unit}{curve}")
     return part, number.reshape(())
 
 

@@ -24,7 +24,7 @@ from calibrate.measurements.collection import Observations, observations
 from calibrate.measurements.displacements import Landmarks
 from calibrate.state_names import in_state
 from emulator.core.cells import Cells, read_cells
-from emulator.core.errors import InputError
+from emulator.core.errors import InputError, look_up
 from emulator.scenes.scene import Scene
 from emulator.specimens.states import falls
 
@@ -217,6 +217,20 @@ def sign_of(scene: Scene, parameter: str, amounts: Mapping[str, float]) -> float
     return -1.0 if negative and limits is not None and limits.low >= 0.0 else 1.0
 
 
+def _check_range(
+    scene: Scene, parameter: str, amounts: Mapping[str, float], path: str | Path
+) -> None:
+    """Raise InputError if the scene's parameter cannot have an amount of a frame."""
+    limits = look_up({p.name: p for p in scene.parameters}, parameter, "--amount: parameter")
+    outside = [f for f, value in amounts.items() if not limits.low <= value <= limits.high]
+    if outside:
+        raise InputError(
+            f"data file {path}: {len(outside)} of {len(amounts)} amounts, frame '{outside[0]}' at "
+            f"{amounts[outside[0]]:.4g}, are outside of the scene's range of '{parameter}', "
+            f"{limits.low:g} to {limits.high:g}: is the unit the scene's? else widen the range"
+        )
+
+
 def _side(amounts: Sequence[float] | np.ndarray) -> int:
     """Return the side of zero on which all amounts are, 0 where they are on both."""
     low, high = np.min(amounts), np.max(amounts)
@@ -319,6 +333,7 @@ def measured_field(
     chosen = spread_points(field.points, min(points, len(field.points)))
     field = field.only(frames or pulled, chosen)
     observe, data = field_data(scene, field, amounts)
+    _check_range(scene, parameter, {frame: amounts[frame] for frame in field.frames}, source)
     parts, beside = dict(observe.parts), list[str]()
     for word, path, pull, force in forces:
         at, forces_at = read_curve(path, pull, force, list(amounts.values()))
@@ -335,9 +350,8 @@ def measured_field(
             parts[in_state(name, frame)] = part
             data[in_state(name, frame)] = np.array(np.interp(amounts[frame], at, forces_at))
     known = {in_state(parameter, frame): amounts[frame] for frame in field.frames}
-    doubts = [*field_doubts(scene, field, amounts, parameter), *beside]
-    if sign < 0.0:
-        doubts.insert(0, _TURNED.format(source, parameter))
+    doubts = [_TURNED.format(source, parameter)] if sign < 0.0 else []
+    doubts += [*field_doubts(scene, field, amounts, parameter), *beside]
     return observations(parts), data, known, doubts
 
 
@@ -360,7 +374,13 @@ def field_data(
         A facet set that is not flat, a point outside, a frame without an amount, or displacements
         that do not follow the amounts.
     """
-    z = scene.mesh.nodes[np.unique(scene.mesh.facet_set(facet_set))][:, 2]
+    try:
+        z = scene.mesh.nodes[np.unique(scene.mesh.facet_set(facet_set))][:, 2]
+    except InputError as error:
+        raise InputError(
+            f"{error}: a full field lies on that flat side of the body, which says its z; name "
+            f"the side that the camera sees '{facet_set}'"
+        ) from error
     if np.ptp(z) > 1e-6 * scene.mesh.size:
         raise InputError(f"facet set '{facet_set}' is not at one z; a full field is of a plane")
     for frame in field.frames:

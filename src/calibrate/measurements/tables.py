@@ -107,6 +107,15 @@ _UNITS = (
 """Columns that may have units in brackets besides those of specimens, and the project's unit."""
 
 
+def _with_known(cells: Cells, loads: Collection[str]) -> Cells:
+    """Return a table with columns such as ``pressure [mmHg]`` as ``known:pressure [mmHg]``."""
+    names = {w: KNOWN + w for w in cells.words if with_unit(w)[0] in loads}
+    for word in set(names.values()) & set(cells.words):
+        raise InputError(f"data file {cells.path}: column '{word}' is there twice")
+    rows = {k: {names.get(w, w): c for w, c in row.items()} for k, row in cells.rows.items()}
+    return cells._replace(words=[names.get(w, w) for w in cells.words], rows=rows)
+
+
 def _without_units(cells: Cells) -> Cells:
     """Return a table with columns such as ``volume [L]`` in the project's units, without them."""
     conversions: dict[str, tuple[str, float]] = {}
@@ -129,12 +138,15 @@ def _without_units(cells: Cells) -> Cells:
     return cells._replace(words=[conversions.get(w, (w, 1.0))[0] for w in cells.words], rows=rows)
 
 
-def read_csv(table: Path | Cells) -> dict[str, CSVTable]:
+def read_csv(table: Path | Cells, loads: Collection[str] = ()) -> dict[str, CSVTable]:
     """Return the table of each load state, by the column ``state`` or a loading curve's rows.
 
     One empty name where the file names no state.
+
+    loads : parameters of loads: a column of such a name has known values.
     """
-    whole = _without_units(table if isinstance(table, Cells) else read_cells(table))
+    cells = table if isinstance(table, Cells) else read_cells(table)
+    whole = _without_units(_with_known(cells, loads))
     words, rows = whole.words, whole.rows
     curve = any(w.startswith(KNOWN) for w in words) and not {STATE, *_PLACES} & set(words)
     if STATE not in words and not curve:

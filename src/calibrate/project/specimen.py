@@ -13,17 +13,25 @@ from calibrate.measurements.specimens import SpecimenCurves
 from calibrate.measurements.stress import is_stress
 from calibrate.measurements.stretch import Stretch
 from calibrate.measurements.tube import TubeForce, TubePressure
-from emulator.core.cells import Cells, read_cells
+from emulator.core.cells import BRANCH, PROTOCOL, Cells, read_cells
 from emulator.core.errors import InputError
-from emulator.core.units import with_unit
+from emulator.core.units import KPA_PER_MMHG, with_unit
 from emulator.mechanics.laws import Law, find_law
 from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.draft import prior_lines
 from emulator.scenes.file import read_scene
+from emulator.scenes.forward_problem import ForwardProblem
 from emulator.scenes.parameter_space import Parameter
-from emulator.specimens.specimen import Specimen, read_states, require_specimen, specimen
-from emulator.specimens.states import AXES, States, pull_columns
+from emulator.specimens.specimen import (
+    Specimen,
+    likely_names,
+    read_states,
+    require_specimen,
+    specimen,
+)
+from emulator.specimens.states import AXES, States, motion_columns, pull_columns
 from emulator.specimens.tube import Tube
+from emulator.specimens.tube import motion_columns as tube_columns
 
 _MODULI = (0.005, 3.0)  # range of a modulus, as a share of the largest stress over its strain
 _EXPONENTS = (0.1, 50.0)
@@ -41,6 +49,9 @@ _GRIPS = (
     "# marks = 2.0   # mm, side of the square in which stretches were measured; not of the grips",
 )
 _Sizes = dict[str, tuple[SpecimenCurves, np.ndarray]]  # each measurement, and its data (m, c)
+_MANY, _MINUTES = 500, 1.0 / 180.0  # states worth a word, and what each takes on one core
+_HIGH = 40.0  # kPa, 300 mmHg: a pressure without a unit that is higher may be in mmHg
+_NARROW, _WIDE = 0.7, 4.0  # stretches around a tube's inside, over the one without pressure
 _DRIFT = 0.05  # share of the largest number by which it may change while the motion is held
 
 
@@ -120,15 +131,23 @@ def _notes(
     """Return one sentence per value that was read or guessed; ``of_law`` is the one on the law."""
     part, _ = next(iter(measured.values()))
     axes = ["stretch_around", "stretch_axial"] if tube else [f"stretch_{a}" for a in AXES]
-    motions = zip(axes, part.stretches.T, strict=False)
+    motions = list(zip(axes, part.stretches.T, strict=False))
     notes = [
         f"{len(part.states.free)} states in {_tests(part.states)}",
-        *(f"{n} from {x.min():.4g} to {x.max():.4g}" for n, x in motions if np.ptp(x) > 0.0),
+        *(
+            f"{n} from {np.nanmin(x):.4g} to {np.nanmax(x):.4g}"
+            if np.nanmax(x) > np.nanmin(x)
+            else f"{n} is {np.nanmin(x):.4g} wherever it is prescribed"
+            for n, x in motions
+            if not np.isnan(x).all()
+        ),
+        *(() if tube is None else _of_tube(part.stretches, measured, cells.words)),
         *(
             f"{name} reaches {_farthest(data, part.at_rest):.3g} {part.unit}".removesuffix(" 1")
             for name, (part, data) in measured.items()
         ),
         *_drifts(list(cells.rows), part.states, measured),
+        *long_table(part.scene),
         of_law,
         f"priors of moduli follow from a stiffness of {slope:.3g} kPa",
         *([] if tube else ['grips = "none": stresses are taken to be even']),
@@ -139,15 +158,60 @@ def _notes(
             for name, (part, _) in measured.items()
         ),
     ]
-    of_tube = (TubePressure.column, TubeForce.column)
-    names = {word: with_unit(word) for word in cells.words}
-    pulls = pull_columns(names).values()
-    stresses = [w for w, (n, _) in names.items() if is_stress(w) or w in pulls or n in of_tube]
-    if bare := [w for w in stresses if not names[w][1]]:
-        notes.insert(1, f"{', '.join(bare)} without a unit: kPa, forces mN; others in brackets")
-    if cells.unloading:
-        notes.insert(1, f"{cells.unloading} rows of unloading are left out")
+    notes[1:1] = _of_columns(cells, tube)
     return notes
+
+
+def _of_columns(cells: Cells, tube: Tube | None) -> Iterator[str]:
+    """Say which rows and columns are left out, and which have no unit."""
+    if cells.unloading:
+        yield f"{cells.unloading} rows of unloading are left out"
+    names = {word: with_unit(word) for word in cells.words}
+    moving = motion_columns(names) if tube is None else tube_columns(names)
+    pulls, of_tube = pull_columns(names).values(), (TubePressure.column, TubeForce.column)
+    stresses = [w for w, (n, _) in names.items() if is_stress(w) or w in pulls or n in of_tube]
+    used = (*moving, *stresses, PROTOCOL, BRANCH, *(w for w in names if w.startswith("area_")))
+    if ignored := [word for word in names if word and word not in used]:
+        likely = likely_names(ignored, of_tube=tube is not None)
+        yield f"columns left out: {', '.join(ignored)}{likely}"
+    if bare := [w for w in stresses if not names[w][1]]:
+        yield f"{', '.join(bare)} without a unit: kPa, forces mN; others in brackets"
+
+
+def _of_tube(stretches: np.ndarray, measured: _Sizes, words: Sequence[str]) -> Iterator[str]:
+    """Ask about what a tube under pressure is not, and say what its table cannot tell.
+
+    stretches : around and along the tube, inside, (m, 3).
+    words : the columns of the table.
+    """
+    around, along, _ = stretches.T
+    if (around * np.sqrt(along)).min() < _NARROW or around.max() > _WIDE:
+        yield (
+            f"CHANGE: the inside is {around.min():.2g} to {around.max():.2g} times as long around "
+            "as in the sector, which no artery under pressure is: is opening_angle of [tube], 0 as "
+            "written, the sector's (an angle makes stretches larger), and the unit of the radii?"
+        )
+    if TubePressure.column in words and (most := np.nanmax(measured[TubePressure.name][1])) > _HIGH:
+        yield (
+            f"CHANGE: a pressure of {most:.3g} without a unit is taken for kPa, "
+            f"{most / KPA_PER_MMHG:.0f} mmHg: call it 'pressure [mmHg]' if it is in mmHg"
+        )
+    if np.ptp(along) == 0.0 and TubeForce.name not in measured:
+        yield (
+            "CHANGE: one axial stretch and no force_axial: pressures alone hardly tell the "
+            "stiffness along the tube from that around it"
+        )
+
+
+def long_table(scene: ForwardProblem) -> Iterator[str]:
+    """Say how long an inference takes, where a specimen has many states."""
+    count = len(scene.states.free) if isinstance(scene, Specimen) else 0
+    if count > _MANY:
+        yield (
+            f"{count} states take some {1.0 + _MINUTES * count:.0f} minutes to sample and certify, "
+            f"in proportion: a table of the means of {round(2 * count / _MANY)} neighbouring rows "
+            "tells a smooth curve as well"
+        )
 
 
 def _farthest(data: np.ndarray, at_rest: float) -> float:
@@ -164,7 +228,9 @@ def _drifts(numbers: Sequence[int], states: States, measured: _Sizes) -> Iterato
         for name, (part, data) in measured.items():
             column = int(np.argmax(np.nan_to_num(np.ptp(data[rows], axis=0))))
             values = data[rows, column]
-            if np.ptp(values) > _DRIFT * np.nanmax(np.abs(data - part.at_rest)):
+            # A stress that grows in rows of one stretch grew between them, by less than is read.
+            rounded = not states.pulls.any() and abs(values[-1]) > abs(values[0])
+            if not rounded and np.ptp(values) > _DRIFT * np.nanmax(np.abs(data - part.at_rest)):
                 unit = "" if part.unit == "1" else f" {part.unit}"
                 yield (
                     f"CHANGE: rows {numbers[rows[0]]} to {numbers[rows[-1]]} hold one state, in "

@@ -24,10 +24,10 @@ OTHER_SPREADSHEETS = (".xls", ".ods")
 """Endings of spreadsheets that are not read."""
 PROTOCOL, BRANCH = "protocol", "branch"
 """Columns of the test that a row belongs to, and of whether it was loading."""
-UNLOADING = "unloading"
-"""The word in the column ``branch`` of rows that are left out."""
+LOADING, UNLOADING = "loading", "unloading"
+"""The words in the column ``branch`` of rows that are data, and of those that are left out."""
 _DIMENSIONLESS = ("-", "1", "mm/mm")
-_THOUSANDS = re.compile(r"[-+]?\d{1,3}(,\d{3})+(\.\d*)?")
+_THOUSANDS = re.compile(r"[-+]?\d{1,3}([., ']\d{3})+([.,]\d*)?")
 _MARKED = re.compile(r"[-+]?\d+([.,])\d+")
 MISSING = ("", "na", "n/a", "nan", "#n/a", "-", "--")
 
@@ -187,6 +187,11 @@ def _of_text(path: Path) -> Raw:
         words, *cells = [[cell.strip() for cell in row] for row in table] or [[]]
     except csv.Error as error:
         raise InputError(f"data file {path} is not a CSV file: {error}") from error
+    if cells and len(words) == 1 and all(len(row[0].split()) > 1 for row in (words, *cells)):
+        raise InputError(
+            f"data file {path}: its columns, '{words[0][:40]}', are separated by blanks: put "
+            "commas, semicolons or tabs between them"
+        )
     return words, cells, delimiter != ","
 
 

@@ -16,9 +16,8 @@ KPA_PER_MMHG, MM3_PER_ML = 0.133322, 1000.0
 
 IN_KPA = {
     "kPa": 1.0, "Pa": 1e-3, "MPa": 1e3, "N/mm2": 1e3, "N/cm2": 10.0, "N/m2": 1e-3, "mN/mm2": 1.0,
-    "mmHg": KPA_PER_MMHG, "psi": 6.894757, "kgf/cm2": 98.0665, "gf/cm2": 0.0980665,
-    "g/cm2": 0.0980665, "bar": 100.0, "dyn/cm2": 1e-4,
-    "cmH2O": 0.0980665,
+    "kN/m2": 1.0, "mmHg": KPA_PER_MMHG, "psi": 6.894757, "lbf/in2": 6.894757, "kgf/cm2": 98.0665,
+    "gf/cm2": 0.0980665, "g/cm2": 0.0980665, "bar": 100.0, "dyn/cm2": 1e-4, "cmH2O": 0.0980665,
 }  # fmt: skip
 """Stresses and pressures."""
 IN_MN = {"mN": 1.0, "N": 1e3, "g": 9.80665, "gf": 9.80665, "kgf": 9806.65, "kN": 1e6}

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.core.cells import PROTOCOL, Cells, read_cells
+from emulator.core.cells import BRANCH, LOADING, PROTOCOL, UNLOADING, Cells, read_cells
 from emulator.core.errors import InputError
 from emulator.core.units import with_unit
 from emulator.geometry.mesh import Mesh, frozen_array
@@ -46,6 +46,9 @@ _CONVENTIONS = (
     (r"(?:sigma|σ|cauchy)_?([xyz])\1?", r"cauchy_\1"),
     (r"(?:p|pk1|stress)_?([xyz])\1?", r"stress_\1"),
     (r"(?:s|pk2)_?([xyz])\1", r"second_\1"),
+    (r"(stretch|strain|stress)", r"\1_x"),
+    (r"(?:engineering|nominal)_(strain|stress)", r"\1_x"),
+    (r"true_stress", r"cauchy_x"),
     (r"axial_(stretch|force)", r"\1_axial"),
     (r"((?:inner|outer)_(?:radius|diameter)|stretch_axial|pressure)", r"\1"),
 )
@@ -243,6 +246,12 @@ def read_states(table: Path | Cells, tube: Tube | None = None) -> States:
             f"{likely_names(cells.words, of_tube=tube is not None)}; it has "
             + ", ".join(filter(None, cells.words))
         )
+    for row in rows if BRANCH in cells.words else ():
+        if (branch := cells.rows[row][BRANCH]).lower() not in ("", LOADING):
+            raise InputError(
+                f"data file {path}: row {row}, column '{BRANCH}' is '{branch}'; give '{LOADING}', "
+                f"or '{UNLOADING}' for rows that are left out"
+            )
     columns = {w: np.array([cells.number(k, w, gaps=True) for k in rows]) for w in words}
     names = [cells.rows[k][PROTOCOL] for k in rows] if PROTOCOL in cells.words else None
     try:

@@ -41,10 +41,13 @@ STRETCHES = (0.1, 12.0)
 _MOST_SHEAR = 5.0
 _UNDOUBTED = 1.0  # strain or shear above which a column has to say that it is not in percent
 _BACK = 0.02  # share of a test's largest motion or pull by which measured ones may go back
-_NOISE, _MOST_BACK = 5.0, 0.1  # sds of noise by which they may go back, and share at most
+_MOST_NOISE = 0.1  # share of the largest above which scatter is no noise but cycles
+_NOISE = 2.2  # times what the largest and the smallest of as many rows of noise differ by
 _STILL, _FEWEST_HELD = 0.002, 3  # share of the largest motion, and rows, of a hold
 _FEWEST_NOISY = 8  # rows of a test that show its noise
-_SD_OF_SECOND_DIFFERENCE = 0.6745 * np.sqrt(6.0)  # median of its size, over the noise's sd
+_DIFFERENCES = ((2, 6.0), (4, 70.0))  # orders, and their variance over that of noise
+_MEDIAN = 0.6745  # of the size of a normal number, over its sd
+_JUMP = 0.1  # share of the largest by which the first row of another test is nearer to rest
 
 
 class States(NamedTuple):
@@ -83,9 +86,11 @@ class States(NamedTuple):
         for rows in self.protocols.values():
             motion = np.hstack([self.gradients[rows].reshape(-1, 9), self.pulls[rows]])
             motion /= np.abs(motion).max(axis=0) + np.finfo(float).tiny
+            usual = np.ptp(motion, axis=0).max() / len(rows)  # dense rows are all near
+            still = min(_STILL, 0.5 * usual)
             start = 0
             for end in range(1, len(rows) + 1):
-                if end < len(rows) and np.abs(motion[end] - motion[start]).max() < _STILL:
+                if end < len(rows) and np.abs(motion[end] - motion[start]).max() <= still:
                     continue
                 if end - start >= _FEWEST_HELD:
                     runs.append(rows[start:end])
@@ -257,50 +262,69 @@ def _check_path(
                     f"row {rows[np.argmax(gaps)] + 1}{test} has no {what} along {axis}, others "
                     "have: give it, leave the row out, or name another test in a column 'protocol'"
                 )
-    away = np.linalg.norm(H, axis=(1, 2))
-    pull = np.linalg.norm(np.nan_to_num(pulls), axis=1)
-    back = np.flatnonzero(falls(away) | falls(pull))
+    ways = np.linalg.norm(H, axis=(1, 2)), np.linalg.norm(np.nan_to_num(pulls), axis=1)
+    back = np.flatnonzero(falls(ways[0]) | falls(ways[1]))
     if not len(back):
         return
-    if _through_rest(H):
+    if _through_rest(H.reshape(len(H), 9)) or _through_rest(np.nan_to_num(pulls)):
         raise InputError(
             f"the rows{test} go through rest, from one side to the other: name the rows of either "
             f"side as a test of its own in a column '{PROTOCOL}', each from rest"
         )
-    reversible = not (falls(away[::-1]) | falls(pull[::-1])).any()
-    raise going_back(f"row {rows[back[0]] + 1}{test} is nearer to rest", reversible=reversible)
+    raise going_back(f"{test} is nearer to rest", rows, back[0], *ways)
 
 
-def going_back(what: str, *, reversible: bool) -> InputError:
-    """Return the refusal of a test that goes back; ``reversible``: not if read from its end."""
-    if reversible:
-        return InputError(
-            f"{what} than one before, and so is each further one: reverse the rows of a test that "
-            "was recorded while it unloads"
+def going_back(fault: str, rows: np.ndarray, back: int, *ways: np.ndarray) -> InputError:
+    """Return the refusal of a test that goes back, from its distances from rest (k,).
+
+    fault : what is said of a row.
+    rows : the numbers of the test's rows, from 0; ``back`` is the first that goes back.
+    """
+    jumps = [np.diff(way) < -_JUMP * way.max() for way in ways]
+    starts = np.flatnonzero(np.any(jumps, axis=0)) + 1
+    parts = [part for way in ways for part in np.split(way, starts)]
+    if not any(falls(way[::-1]).any() for way in ways):
+        hint = (
+            ", and so is each further one: reverse the rows of a test that was recorded while it "
+            "unloads"
         )
-    return InputError(
-        f"{what} than one before: rows of a test are in the order of its loading, unloading goes "
-        f"under '{UNLOADING}' in a column '{BRANCH}', another test under another name in a column "
-        f"'{PROTOCOL}'"
-    )
+    elif len(starts) and not any(len(p) < _FEWEST_HELD or falls(p).any() for p in parts):
+        back = starts[0]
+        hint = (
+            " by one step, and rises again: if another test begins there, name the test of each "
+            f"row in a column '{PROTOCOL}'"
+        )
+    else:
+        hint = (
+            f": rows of a test are in the order of its loading, unloading goes under '{UNLOADING}' "
+            f"in a column '{BRANCH}', another test under another name in a column '{PROTOCOL}'"
+        )
+    return InputError(f"row {rows[back] + 1}{fault} than one before{hint}")
 
 
 def falls(way: np.ndarray) -> np.ndarray:
-    """Return whether each of a test's distances from rest (k,) is less than one before it.
+    r"""Return whether each of a test's distances from rest (k,) is less than one before it.
 
-    Measured ones may go back by 2 % of the largest, or by their noise, which second differences
-    show.
+    Measured ones may go back by 2 % of the largest, or by noise. Differences of second and fourth
+    order show its sd s: a curve has small ones, and cycles of a few rows not both. The means of w
+    neighbours of k rows of noise are within :math:`2 s \sqrt{2 \ln k / w}` of each other, so that
+    a return of some rows is seen beside more noise than that of one.
     """
-    bends, tolerance = np.abs(np.diff(way, 2)), _BACK * way.max()
-    if len(way) >= _FEWEST_NOISY:
-        noise = np.median(bends) / _SD_OF_SECOND_DIFFERENCE
-        tolerance = max(tolerance, min(_NOISE * noise, _MOST_BACK * way.max()))
-    return np.maximum.accumulate(way) - way > tolerance
+    count, largest, noise = len(way), way.max(), 0.0
+    if count >= _FEWEST_NOISY:
+        sizes = [np.median(np.abs(np.diff(way, k))) / v**0.5 for k, v in _DIFFERENCES]
+        noise = min(sizes) / _MEDIAN
+    admitted = _NOISE * np.sqrt(2.0 * np.log(count)) * noise * (noise < _MOST_NOISE * largest)
+    result, width = np.zeros(count, bool), 1
+    while width == 1 or 4 * width <= count:
+        means = np.convolve(way, np.full(width, 1.0 / width), "valid")
+        fall = np.maximum.accumulate(means) - means
+        result[width - 1 :] |= fall > max(_BACK * largest, admitted / np.sqrt(width))
+        width *= 2
+    return result
 
 
-def _through_rest(H: np.ndarray) -> bool:
-    """Return whether the states (k, 3, 3) of a test lie on one line through rest, in order."""
-    flat = H.reshape(len(H), -1)
-    along = flat @ (flat[-1] - flat[0])
-    steps = np.diff(along)
-    return bool(along[0] < 0.0 < along[-1] and (steps > -_BACK * np.ptp(along)).all())
+def _through_rest(motion: np.ndarray) -> bool:
+    """Return whether the states (k, c) of a test lie on one line through rest, in order."""
+    along = motion @ (motion[-1] - motion[0])
+    return bool(along[0] < 0.0 < along[-1] and not falls(along - along[0]).any())

@@ -224,10 +224,7 @@ def _check_path(inner: np.ndarray, axial: np.ndarray, rows: np.ndarray, name: st
     back = np.flatnonzero(falls(way) & (axial <= axial[_largest_before(way)]))
     if len(back):
         test = f" of '{name}'" if name else ""
-        raise going_back(
-            f"row {rows[back[0]] + 1}{test} has a smaller radius",
-            reversible=not falls(way[::-1]).any(),
-        )
+        raise going_back(f"{test} has a smaller radius", rows, back[0], way)
 
 
 def _largest_before(way: np.ndarray) -> np.ndarray:

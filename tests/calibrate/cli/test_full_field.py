@@ -1,5 +1,7 @@
 """``calibrate frames --field``: tables of a correlation to the data of a run, and back."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -88,6 +90,7 @@ def test_some_frames_and_points_may_be_enough(folder, capsys):
         ((*FIELD, "--force", "reaction:right:x=force.csv"), "give REACTION=FILE:AMOUNT:COLUMN"),
         ((*FIELD, "--force", "reaction:top:x=force.csv:u:F"), "no support on 'top'"),
         ((*FIELD, "--surface", "top@a=a.stl"), "give either --surface or --field"),
+        ((*FIELD[:-1], f"pul={PADS}"), "--amount: parameter 'pul' is unknown"),
     ],
 )
 def test_what_cannot_be_is_refused_in_a_line(folder, capsys, words, line):
@@ -98,3 +101,23 @@ def test_a_force_that_ends_before_the_frames_is_refused(folder, capsys):
     (folder / "force.csv").write_text("u,F\n0,0\n-1.5,-0.3\n")
     words = (*FIELD, "--force", "reaction:right:x=force.csv:u:F", "--out", "field.csv")
     assert "goes from 0 to 1.5, frame '9' is at 2" in complaint(capsys, *words)
+
+
+def test_amounts_that_the_scene_cannot_have_are_refused(folder, capsys):
+    (folder / "pads.csv").write_text("frame,ux\n0,0\n5,100\n9,2000\n")
+    told = complaint(capsys, *FIELD, "--out", "field.csv")
+    assert (
+        "2 of 2 amounts, frame '5' at 100, are outside of the scene's range of 'pull', 0 to" in told
+    )
+    (folder / "pads.csv").write_text("frame,ux\n0,0\n5,3.0\n9,3.1\n")
+    assert "1 of 2 amounts, frame '9' at 3.1," in complaint(capsys, *FIELD, "--out", "field.csv")
+    assert main([*FIELD, "--only", "5", "--out", "field.csv"]) == 0
+
+
+def test_a_field_says_why_it_needs_the_side_that_the_camera_sees(folder, capsys):
+    sheet = box((20.0, 10.0, 1.0), (4, 2, 1))
+    front = {("front" if n == "top" else n): facets for n, facets in sheet.facet_sets.items()}
+    write_mesh("sheet.vtu", replace(sheet, facet_sets=front))
+    told = complaint(capsys, *FIELD, "--out", "field.csv")
+    assert "facet set 'top' is not in the mesh; its sets:" in told
+    assert "name the side that the camera sees 'top'" in told

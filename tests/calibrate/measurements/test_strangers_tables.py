@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from calibrate.cli import main
 from calibrate.measurements.data import read_measurements
+from calibrate.project import calibration
 from calibrate.project.specimen import draft_specimen
 from emulator.core.cells import read_cells
 from emulator.core.errors import InputError
@@ -240,6 +242,61 @@ def test_a_hold_is_said_and_a_test_from_its_end_is_reversed(tmp_path):
     assert "reverse the rows" in told
 
 
+def test_a_dense_table_has_no_holds(tmp_path):
+    stretch = np.linspace(1.0, 1.3, 1600)
+    stress = 30.0 * (stretch - 1.0) + np.random.default_rng(0).normal(size=1600)
+    notes = draft(tmp_path, "stretch_x,stress_x", stretch, stress).notes
+    assert not any("hold one state" in note for note in notes)
+    (tmp_path / "read").mkdir()  # to three digits, of a small pull
+    pulls = np.round(1.0 + np.linspace(0.0, 0.02, 60), 3)
+    read = draft(tmp_path / "read", "stretch_x,stress_x", pulls, np.linspace(0.0, 5.0, 60)).notes
+    assert not any("hold one state" in note for note in read)
+    (said,) = [note for note in notes if "minutes" in note]
+    assert said.startswith("1600 states take some 10 minutes to sample and certify, in proportion")
+    assert "the means of 6 neighbouring rows" in said
+    (tmp_path / "few").mkdir()
+    few = draft(tmp_path / "few", "stretch_x,stress_x", stretch[::8], stress[::8]).notes
+    assert not any("minutes" in note for note in few)
+
+
+def test_inference_of_a_long_table_says_how_long_it_takes_before_it_begins(
+    tmp_path, capsys, monkeypatch
+):
+    def no_sampling(*arguments, **options):
+        raise InputError("sampling begins")
+
+    monkeypatch.setattr(calibration, "sample", no_sampling)
+    stretch = np.linspace(1.0, 1.3, 600)
+    draft(tmp_path, "stretch_x,stress_x", stretch, 30.0 * (stretch - 1.0))
+    assert main(["infer", str(tmp_path / "x.toml"), "--out", str(tmp_path / "run")]) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert said[-2].startswith("600 states take some 4 minutes to sample and certify")
+    assert "sampling begins" in said[-1]
+
+
+def test_a_tube_s_axial_stretch_is_said_and_what_no_tube_under_pressure_is_is_asked(tmp_path):
+    radius, words = np.linspace(0.4, 0.5, 30), "inner_radius [mm],stretch_axial,pressure"
+
+    def notes(scale, *columns, more=""):
+        for file in tmp_path.glob("*.toml"):
+            file.unlink()
+        tube = Tube(0.36, (0.1,))
+        return " ".join(draft(tmp_path, words + more, scale * radius, *columns, tube=tube).notes)
+
+    held = np.full(30, 1.2), STRESS
+    told = notes(1.0, *held)
+    assert "stretch_axial is 1.2 wherever it is prescribed" in told
+    assert "one axial stretch and no force_axial" in told
+    assert "no artery" not in told
+    assert "no force_axial" not in notes(1.0, *held, STRESS, more=",force_axial")
+    assert "no force_axial" not in notes(1.0, np.linspace(1.0, 1.2, 30), STRESS)
+    told = notes(0.3, *held)
+    assert "CHANGE: the inside is 0.36 to 0.44 times as long around as in the sector, which" in told
+    assert "which no artery" in notes(5.0, *held)
+    # A stretched tube without pressure is thinner, and that is right.
+    assert "no artery" not in notes(0.75, np.full(30, 1.6), STRESS)
+
+
 @pytest.mark.parametrize(
     ("text", "line"),
     [
@@ -265,8 +322,128 @@ def test_volumes_pressures_and_places_may_have_units(tmp_path, ventricle):
     assert data.keys() == other.keys()
     for name, values in data.items():
         np.testing.assert_allclose(values, other[name], rtol=1e-12)
+    (tmp_path / "plain.csv").write_text(text.replace("known:", "").format(0.68 / 0.133322, 6.3))
+    _, _, plain = read_measurements(ventricle, tmp_path / "plain.csv")
+    assert plain["pressure@1"] == pytest.approx(0.68)
+    (tmp_path / "bad.csv").write_text("volume,pressure,known:pressure\n118.0,0.68,0.6\n")
+    with pytest.raises(InputError, match="column 'known:pressure' is there twice"):
+        read_measurements(ventricle, tmp_path / "bad.csv")
+    (tmp_path / "bad.csv").write_text("volume,LVP\n118.0,0.68\n122.0,0.8\n")
+    with pytest.raises(InputError, match="one, in mL; rows of a loading curve have a column 'pr"):
+        read_measurements(ventricle, tmp_path / "bad.csv")
     (tmp_path / "bad.csv").write_text("volume [pt],known:pressure\n118.0,0.68\n")
     with pytest.raises(
         InputError, match=r"column 'volume \[pt\]': unit 'pt' is unknown; one of mL"
     ):
         read_measurements(ventricle, tmp_path / "bad.csv")
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_a_small_pull_beside_its_noise_is_loading_and_a_branch_of_some_rows_is_not(tmp_path, seed):
+    """Noise of 4 % of the pull, by marker or load cell; the branch goes back by a third or more."""
+    rng = np.random.default_rng(seed)
+    count, share = int(rng.integers(12, 240)), 0.04
+    way = np.linspace(0.0, 1.0, count) ** rng.choice([0.5, 1.0, 2.0])
+    rows = int(rng.integers(5, 9))
+    branch = np.append(way, 1.0 - rng.uniform(0.35, 0.7) * np.arange(1, rows + 1) / rows)
+    way, branch = (w + share * rng.normal(size=len(w)) for w in (way, branch))
+    for header, scale in (("stretch_x", 0.05), ("applied_x [kPa],stretch_x", 2.0)):
+        for file in tmp_path.glob("*.toml"):
+            file.unlink()
+        rest = float(header == "stretch_x")
+        stress = "stress_x," if rest else ""
+        columns = [rest + scale * w for w in (way, branch)]
+        names = f"{header},{stress}".removesuffix(",")
+        told = refusal(tmp_path, names, columns[1], 1.0 + 0.1 * branch)
+        assert "unloading goes under 'unloading'" in told
+        assert f"{count} states" in draft(tmp_path, names, columns[0], 1.0 + 0.1 * way).notes[0]
+
+
+@pytest.mark.parametrize("period", [4, 5, 6, 8])
+def test_cycles_of_few_rows_are_no_noise(tmp_path, period):
+    """Five cycles back to 70 % of the largest pull, some rows each."""
+    phase = np.arange(5 * period) % period / period
+    way = np.append(np.linspace(0.0, 1.0, 8)[:-1], 0.7 + 0.3 * np.abs(2.0 * phase - 1.0))
+    told = refusal(tmp_path, "stretch_x,stress_x", 1.0 + 0.2 * way, way)
+    assert "than one before" in told
+
+
+def test_two_tests_in_one_table_and_sweeps_of_a_load_get_their_own_words(tmp_path):
+    pulls = np.append(STRETCH, 1.0 + 2.0 * (STRETCH - 1.0))
+    told = refusal(tmp_path, "stretch_x,stress_x", pulls, pulls - 1.0)
+    assert "row 31 is nearer to rest than one before by one step, and rises again: if an" in told
+    assert "in a column 'protocol'" in told
+    assert "unloading" not in told
+    ones, load = np.ones(30), np.linspace(0.0, 5.0, 30)
+    along = np.append(STRETCH, ones), np.append(ones, STRETCH), np.tile(STRESS, 2)
+    assert "row 31 is" in refusal(tmp_path, "stretch_x,stretch_y,stress_x", *along)
+    told = refusal(tmp_path, "applied_x,stretch_x", np.tile(load, 2), pulls)
+    assert "if another test begins there" in told
+    told = refusal(tmp_path, "applied_x,stretch_x", load - 2.5, STRETCH - 0.1)
+    assert "go through rest" in told
+    radius, words = np.tile(0.4 + 0.2 * (STRETCH - 1.0), 2), "inner_radius,stretch_axial,pressure"
+    columns = radius, np.full(60, 1.2), np.tile(STRESS, 2)
+    told = refusal(tmp_path, words, *columns, tube=Tube(0.36, (0.1,)))
+    assert "row 31 has a smaller radius than one before by one step" in told
+    # The same test unloaded quickly, with rows on the way: unloading.
+    cycle = np.concatenate([STRETCH, [1.1, 1.05, 1.0], STRETCH])
+    told = refusal(tmp_path, "stretch_x,stress_x", cycle, cycle - 1.0)
+    assert "unloading goes under 'unloading'" in told
+
+
+@pytest.mark.parametrize("unit", ["kN/m2", "KN/m^2", "kpa"])
+def test_kilopascals_have_many_names(tmp_path, unit):
+    notes = draft(tmp_path, f"stretch_x,stress_x [{unit}]", STRETCH, STRESS).notes
+    assert f"stress reaches {STRESS[-1]:.3g} kPa" in notes
+
+
+def test_columns_that_are_left_out_are_named(tmp_path):
+    time, true = np.arange(30), STRESS * STRETCH
+    columns = "time [s],stretch_x,stress_x [kPa],true_stress [kPa]"
+    (said,) = [
+        n for n in draft(tmp_path, columns, time, STRETCH, STRESS, true).notes if "left" in n
+    ]
+    assert said == (
+        "columns left out: time [s], true_stress [kPa]; call true_stress [kPa] cauchy_x [kPa] if "
+        "they are that"
+    )
+    for file in tmp_path.glob("*.toml"):
+        file.unlink()
+    told = refusal(tmp_path, "Stretch,Stress (MPa)", STRETCH, STRESS)
+    assert "call Stretch stretch_x, Stress (MPa) stress_x [MPa] if they are that" in told
+
+
+def test_words_of_branches_blanks_and_marks_of_thousands_that_are_none(tmp_path):
+    branches = ["load"] * 15 + ["unload"] * 15
+    told = refusal(tmp_path, "branch,stretch_x,stress_x", branches, STRETCH, STRESS)
+    assert "column 'branch' is 'load'; give 'loading', or 'unloading' for rows" in told
+    for text, line in (
+        ("stretch_x stress_x\n1.0 0\n1.1 3\n", "are separated by blanks: put commas"),
+        ("stretch_x;stress_x [Pa]\n1;0\n1,1;1.004,9\n", "leave out marks of thousands"),
+    ):
+        (tmp_path / "t.csv").write_text(text)
+        with pytest.raises(InputError, match=line):
+            draft_specimen(tmp_path / "t.csv", tmp_path / "x.toml")
+
+
+def test_a_pressure_that_may_be_in_mmhg_is_asked_about(tmp_path):
+    radius, pressure = np.linspace(0.4, 0.5, 30), np.linspace(0.0, 150.0, 30)
+    asked = []
+    for unit in ("", " [mmHg]"):
+        words = f"inner_radius [mm],stretch_axial,pressure{unit}"
+        columns = radius, np.full(30, 1.2), pressure
+        asked += [n for n in draft(tmp_path, words, *columns, tube=Tube(0.36, (0.1,))).notes
+                  if "'pressure [mmHg]'" in n]  # fmt: skip
+        for file in tmp_path.glob("*.toml"):
+            file.unlink()
+    (said,) = asked
+    assert "a pressure of 150 without a unit is taken for kPa, 1125 mmHg" in said
+
+
+def test_a_stretch_of_some_tests_is_said(tmp_path):
+    """A pull whose shear is 0, and a shear without stretches, as shear_from_zero has them."""
+    tests, shear = ["pull"] * 30 + ["shear"] * 30, np.append(np.zeros(30), 2.0 * (STRETCH - 1.0))
+    columns = [*STRETCH, *HALF], shear, [*STRESS, *HALF], [*HALF, *(3.0 * shear[30:])]
+    header = "protocol,stretch_x,shear_xy,stress_x,stress_xy"
+    notes = draft(tmp_path, header, tests, *columns).notes
+    assert "stretch_x from 1 to 1.2" in notes
