@@ -202,7 +202,12 @@ def _are_one(endocardium: Surface, epicardium: Surface) -> bool:
 
 
 def _check_options(
-    order: int, unit: str, smooth: int, least: float | None, ventricles: str | None, right: Source | None
+    order: int,
+    unit: str,
+    smooth: int,
+    least: float | None,
+    ventricles: str | None,
+    right: Source | None,
 ) -> None:
     """Raise :class:`InputError` for options that are out of range."""
     if order not in (1, 2):
