@@ -263,6 +263,8 @@ INFERENCES = [
     ("--data book.xlsx", "book.xlsx is not a readable spreadsheet"),
     ("--data metres.csv", "m instead of mm? multiply by 1000"),
     ("--data centimetres.csv", "cm instead of mm? multiply by 10 "),
+    ("--data pixels.csv", "pixels instead of mm? multiply by the size of a pixel in mm ("),
+    ("--data swapped.csv", "with columns uy and uz swapped: put the columns in order ("),
     ("--data zero.csv", "displacement data are all zero; predictions reach"),
     ("--data huge.csv", "times larger than predicted (largest 1e+09"),
     ("--truth mu=73 mu=74 lam=61", "'mu' is given twice"),

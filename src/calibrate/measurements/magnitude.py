@@ -16,12 +16,17 @@ and n numbers. The second conditions keep noisy data: however large the noise, d
 corner of the prior that no draw came near. Before data is refused, predictions like it are sought
 at more draws, and by descents of :math:`\|y - g(x)\|` from the nearest of them, as a second mode
 may be small.
+
+Displacements of any size are refused where the least angle between them and a prediction has a
+sine that is more than halved, and below a half, once two columns are swapped; what is left must
+be above the noise, too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from itertools import combinations
 
 import jax
 import jax.numpy as jnp
@@ -29,15 +34,17 @@ import numpy as np
 
 from calibrate.measurements.collection import Observations
 from calibrate.measurements.observation import Observation
+from calibrate.measurements.points import DisplacementPoints
 from emulator.core.errors import InputError
 from emulator.core.minimise import minimise
-from emulator.core.units import other_units
+from emulator.core.units import PIXELS, in_pixels, other_units
 
 _DRAWS = 32  # predictions at draws of the prior
 PRIOR_DRAWS = 4096  # draws whose extremes approximate the ends of a parameter's prior
 _MORE_DRAWS, _DESCENTS, _STEPS = 256, 4, 30  # effort of the search before data is refused
 _FACTOR = 2.0
 _NOISE_SD = 5.0
+_ALONG = 0.5  # sine of the angle to a prediction, below which data are along it
 _OVERRULE = "check_scale=False or --no-unit-check overrules"
 
 
@@ -63,11 +70,58 @@ def check_magnitudes(
     predictions : those of :func:`predict_over_prior`, by observation.
     """
     for name, part in observe.parts.items():
-        if complaint(name, part, data[name], predictions[name], sd[name]) is None:
+
+        def fault(among: np.ndarray, name: str = name, part: Observation = part) -> str | None:
+            line = complaint(name, part, data[name], among, sd[name])
+            if line is None and isinstance(part, DisplacementPoints):
+                return _swapped(observe, name, part, data[name], among, sd[name])
+            return line
+
+        if fault(predictions[name]) is None:
             continue
         more = np.concatenate([predictions[name], _closest(predict, name, data[name], draws)])
-        if (line := complaint(name, part, data[name], more, sd[name])) is not None:
+        if (line := fault(more)) is not None:
             raise InputError(line)
+
+
+def _swapped(
+    observe: Observations,
+    name: str,
+    part: DisplacementPoints,
+    data: np.ndarray,
+    among: np.ndarray,
+    sd: float,
+) -> str | None:
+    """Return a message if displacements are along a prediction once two columns are swapped."""
+    u, *fields = (observe.filled(name, values) for values in (data, *among))
+    columns = part.value_fields[0].columns
+    apart = _apart(u, fields)
+    if not _norm(data) * apart > sd * (np.sqrt(data.size) + _NOISE_SD):
+        return None
+    for pair in combinations(range(3), 2):
+        swapped = u.copy()
+        swapped[:, pair] = u[:, pair[::-1]]
+        left = _apart(swapped, fields)
+        if left < _ALONG and _FACTOR * left < apart:
+            first, second = (columns[k] for k in pair)
+            return (
+                f"{name} data are {100 * apart:.0f} % off any prediction, whatever its size, and "
+                f"{100 * left:.0f} % with columns {first} and {second} swapped: put the columns "
+                f"in order ({_OVERRULE})"
+            )
+    return None
+
+
+def _apart(u: np.ndarray, fields: Sequence[np.ndarray]) -> float:
+    """Return the least sine of the angle between data (d, 3) and a field; 1 if none is along it."""
+    sines = [1.0]
+    for field in fields:
+        known = np.isfinite(u) & np.isfinite(field)
+        y, g = u[known], field[known]
+        size = _norm(y) * _norm(g)
+        if size > 0.0:
+            sines.append(float(np.sqrt(1.0 - np.clip(y @ g / size, 0.0, 1.0) ** 2)))
+    return min(sines)
 
 
 def predict_over_prior(
@@ -163,9 +217,11 @@ def _guess(part: Observation, size: float, norms: np.ndarray, ratio: float) -> s
         for unit, factor in other_units(part.unit).items()
         if norms.min() / _FACTOR < factor * size < norms.max() * _FACTOR
     }
+    unit = min(fitting, key=lambda other: abs(np.log(fitting[other] / ratio)), default="")
+    if in_pixels(part.unit, ratio, fitting.get(unit)):
+        return PIXELS
     if not fitting:
         return "check their unit, and that they belong to this scene"
-    unit = min(fitting, key=lambda other: abs(np.log(fitting[other] / ratio)))
     return f"{unit} instead of {part.unit}? multiply by {fitting[unit]:g}"
 
 

@@ -14,6 +14,7 @@ import emulator as em
 from calibrate.certificate import examine
 from calibrate.certificate.check import _further_runs, _rounds
 from calibrate.posterior import Posterior, read_tree
+from calibrate.posterior.diagnosis import misfits
 from certificate_support import (
     NODES,
     exact_data,
@@ -187,9 +188,13 @@ def test_adaptive_runs_are_as_many_as_planned(count):
 def test_misfit_is_not_certified(beam, fem, data):
     spoiled = data.copy()
     spoiled[2, 0] += 1.5
-    _, certificate = certified(beam, fem, spoiled, fem)
+    posterior, certificate = certified(beam, fem, spoiled, fem)
     assert certificate.verdict == "not certified"
-    assert "displacement[2, 0]" in certificate.findings[0]
+    (part,) = posterior.model.observe.parts.values()
+    at = ", ".join(f"{x:g}" for x in part.points[2])
+    place = f"displacement x of node {part.nodes[2]} at ({at}) mm"
+    assert place in certificate.findings[0]
+    assert any(place in line for line in misfits(posterior.tree))
 
 
 def test_bad_chains_are_not_certified(beam, fem, data):
