@@ -136,6 +136,7 @@ def folder(tmp_path_factory):
         ("metres", 0.06),
         ("centimetres", 6.0),
         ("pixels", 720.0),
+        ("upside_down", -60.0),
         ("zero", 0.0),
         ("huge", 1e9),
     ):

@@ -18,8 +18,8 @@ at more draws, and by descents of :math:`\|y - g(x)\|` from the nearest of them,
 may be small.
 
 Displacements of any size are refused where the least angle between them and a prediction has a
-sine that is more than halved, and below a half, once two columns are swapped; what is left must
-be above the noise, too.
+sine above 0.2 and above the noise that is more than halved, and below a half, once two columns
+are swapped or a sign is reversed.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ PRIOR_DRAWS = 4096  # draws whose extremes approximate the ends of a parameter's
 _MORE_DRAWS, _DESCENTS, _STEPS = 256, 4, 30  # effort of the search before data is refused
 _FACTOR = 2.0
 _NOISE_SD = 5.0
-_ALONG = 0.5  # sine of the angle to a prediction, below which data are along it
+_ALONG, _ASTRAY = 0.5, 0.2  # sines of the angle to a prediction: data are along it, or are not
 _OVERRULE = "check_scale=False or --no-unit-check overrules"
 
 
@@ -74,7 +74,7 @@ def check_magnitudes(
         def fault(among: np.ndarray, name: str = name, part: Observation = part) -> str | None:
             line = complaint(name, part, data[name], among, sd[name])
             if line is None and isinstance(part, DisplacementPoints):
-                return _swapped(observe, name, part, data[name], among, sd[name])
+                return _mistaken_columns(observe, name, part, data[name], among, sd[name])
             return line
 
         if fault(predictions[name]) is None:
@@ -84,7 +84,7 @@ def check_magnitudes(
             raise InputError(line)
 
 
-def _swapped(
+def _mistaken_columns(
     observe: Observations,
     name: str,
     part: DisplacementPoints,
@@ -92,24 +92,26 @@ def _swapped(
     among: np.ndarray,
     sd: float,
 ) -> str | None:
-    """Return a message if displacements are along a prediction once two columns are swapped."""
+    """Return a message if displacements are along a prediction once columns are put right."""
     u, *fields = (observe.filled(name, values) for values in (data, *among))
-    columns = part.value_fields[0].columns
+    columns = part.values_in(*part.selection)[0].columns
     apart = _apart(u, fields)
-    if not _norm(data) * apart > sd * (np.sqrt(data.size) + _NOISE_SD):
+    if not apart > max(_ASTRAY, sd * (np.sqrt(data.size) + _NOISE_SD) / _norm(data)):
         return None
-    for pair in combinations(range(3), 2):
-        swapped = u.copy()
-        swapped[:, pair] = u[:, pair[::-1]]
-        left = _apart(swapped, fields)
-        if left < _ALONG and _FACTOR * left < apart:
-            first, second = (columns[k] for k in pair)
-            return (
-                f"{name} data are {100 * apart:.0f} % off any prediction, whatever its size, and "
-                f"{100 * left:.0f} % with columns {first} and {second} swapped: put the columns "
-                f"in order ({_OVERRULE})"
-            )
-    return None
+    mended = {"all signs reversed": -u}
+    for k, column in enumerate(columns):
+        mended[f"the sign of {column} reversed"] = np.where(np.arange(3) == k, -u, u)
+    for i, k in combinations(range(3), 2):
+        order = np.arange(3)
+        order[[i, k]] = k, i
+        mended[f"columns {columns[i]} and {columns[k]} swapped"] = u[:, order]
+    left, change = min((_apart(other, fields), change) for change, other in mended.items())
+    if not (left < _ALONG and _FACTOR * left < apart):
+        return None
+    return (
+        f"{name} data are {100 * apart:.0f} % off any prediction, whatever its size, and "
+        f"{100 * left:.0f} % with {change}: put the columns right ({_OVERRULE})"
+    )
 
 
 def _apart(u: np.ndarray, fields: Sequence[np.ndarray]) -> float:

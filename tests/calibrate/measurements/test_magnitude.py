@@ -101,7 +101,7 @@ def test_the_smallest_and_the_largest_prediction_are_among_those_made(model, bea
 
 
 @pytest.mark.parametrize("pair", [(0, 1), (0, 2), (1, 2)])
-def test_columns_that_are_swapped_are_named(model, exact, pair):
+def test_columns_that_are_swapped_are_named(model, forward, exact, pair):
     """One camera sees no z; noise as large as the signal says nothing."""
     swapped, words = exact.copy(), f"columns u{'xyz'[pair[0]]} and u{'xyz'[pair[1]]} swapped: put"
     swapped[:, pair] = exact[:, pair[::-1]]
@@ -110,7 +110,9 @@ def test_columns_that_are_swapped_are_named(model, exact, pair):
     if pair == (0, 1):
         with pytest.raises(InputError, match=words):
             model.given(np.where([True, True, False], swapped, np.nan))
-    noisy = cal.model(model.forward, model.observe, cal.GaussianNoise(sd=np.abs(exact).max()))
+    with pytest.raises(InputError, match=f"sign of u{'xyz'[pair[1]]} reversed: put"):
+        model.given(np.where(np.arange(3) == pair[1], -exact, exact))
+    noisy = cal.model(forward, model.observe, cal.GaussianNoise(sd=np.abs(exact).max()))
     noisy.check_data(swapped)
 
 
@@ -121,7 +123,7 @@ def test_columns_in_order_are_taken_whatever_the_noise(model, forward):
         for theta in rng.uniform(50.0, 100.0, (20, 2)):
             u = np.asarray(forward.at(np.array(NODES))(jnp.array(theta)))
             sd = share * np.sqrt(np.mean(u**2))
-            noisy = cal.model(model.forward, model.observe, cal.GaussianNoise(sd=sd))
+            noisy = cal.model(forward, model.observe, cal.GaussianNoise(sd=sd))
             noisy.check_data(u + rng.normal(0.0, sd, u.shape))
 
 

@@ -146,6 +146,9 @@ def test_the_posterior_says_what_is_missing(model, data):
     posterior = cal.sample(model, data, options=options)
     tree = posterior.tree
     assert json.loads(tree.attrs["missing"]) == {"displacement": WITHOUT}
+    names = json.loads(tree.attrs["data"])["displacement"]
+    assert len(names) == 8
+    assert names[-1].startswith("displacement z of node ")
     observed = tree["observed_data"]["displacement"]
     np.testing.assert_array_equal(observed, data[~np.isnan(data)])
     assert observed.dims == ("entry_displacement",)

@@ -1,5 +1,6 @@
 """Data that could not have come from the model is told, other data is not."""
 
+import json
 import re
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 import xarray as xr
 from scipy.stats import chi2
 
-from calibrate.posterior.diagnosis import SMALLEST_P, misfit_of, misfits
+from calibrate.posterior.diagnosis import DATUM_NAMES, SMALLEST_P, misfit_of, misfits
 
 
 def tree(data, sd=1.0, correlated=False):
@@ -44,6 +45,15 @@ def test_what_is_wrong_is_told(change, said):
     (sentence,) = misfits(tree(change(y)))
     assert sentence.startswith("u does not fit the model")
     assert re.search(said, sentence)
+
+
+def test_a_datum_is_named_as_the_posterior_names_it():
+    y = np.random.default_rng(2).normal(size=(20, 3))
+    y[2, 1] += 9.0
+    names = [f"displacement {x} at ({k}, 0, 0) mm in state late" for k in range(20) for x in "xyz"]
+    named = tree(y)
+    named.attrs[DATUM_NAMES] = json.dumps({"u": names})
+    assert "(displacement y at (2, 0, 0) mm in state late is " in misfits(named)[0]
 
 
 def test_missing_data_are_left_out_and_one_number_has_no_place():

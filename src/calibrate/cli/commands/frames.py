@@ -97,6 +97,8 @@ _Measured = tuple[Any, dict[str, Any], dict[str, float], list[str]]
 
 
 def _surfaces(scene: Scene, arguments: Namespace) -> _Measured:
+    import numpy as np
+
     from calibrate.measurements.frame_checks import frame_doubts
     from calibrate.measurements.frames import frame_data
     from calibrate.state_names import states_of
@@ -119,6 +121,12 @@ def _surfaces(scene: Scene, arguments: Namespace) -> _Measured:
             ]
             raise InputError(f"--surface '{name}' is there twice, {' and '.join(paths)}; give one")
         surfaces[name] = read_surface(path, name, IN_MM[arguments.unit])
+        for other, before in surfaces.items():
+            if other != name and np.array_equal(before.points, surfaces[name].points):
+                raise InputError(
+                    f"--surface '{other}' and '{name}' are one surface, {path}; each frame and "
+                    "wall has its own"
+                )
     observe, data = frame_data(scene, surfaces, arguments.points)
     return observe, data, {}, [*frame_doubts(scene.mesh, surfaces, observe, data)]
 
