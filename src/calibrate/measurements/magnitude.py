@@ -93,16 +93,19 @@ def _mistaken_columns(
     sd: float,
 ) -> str | None:
     """Return a message if displacements are along a prediction once columns are put right."""
-    u, *fields = (observe.filled(name, values) for values in (data, *among))
-    columns = part.values_in(*part.selection)[0].columns
+    known = np.isfinite(observe.filled(name, data))
+    measured = np.flatnonzero(known.any(axis=0))  # one camera sees no uz
+    whole = np.ix_(known[:, measured].all(axis=1), measured)
+    u, *fields = (observe.filled(name, values)[whole] for values in (data, *among))
+    columns = [part.values_in(*part.selection)[0].columns[k] for k in measured]
     apart = _apart(u, fields)
-    if not apart > max(_ASTRAY, sd * (np.sqrt(data.size) + _NOISE_SD) / _norm(data)):
+    if apart <= _ASTRAY or _norm(data) * apart <= sd * (np.sqrt(data.size) + _NOISE_SD):
         return None
     mended = {"all signs reversed": -u}
     for k, column in enumerate(columns):
-        mended[f"the sign of {column} reversed"] = np.where(np.arange(3) == k, -u, u)
-    for i, k in combinations(range(3), 2):
-        order = np.arange(3)
+        mended[f"the sign of {column} reversed"] = np.where(np.arange(len(columns)) == k, -u, u)
+    for i, k in combinations(range(len(columns)), 2):
+        order = np.arange(len(columns))
         order[[i, k]] = k, i
         mended[f"columns {columns[i]} and {columns[k]} swapped"] = u[:, order]
     left, change = min((_apart(other, fields), change) for change, other in mended.items())
@@ -115,15 +118,10 @@ def _mistaken_columns(
 
 
 def _apart(u: np.ndarray, fields: Sequence[np.ndarray]) -> float:
-    """Return the least sine of the angle between data (d, 3) and a field; 1 if none is along it."""
-    sines = [1.0]
-    for field in fields:
-        known = np.isfinite(u) & np.isfinite(field)
-        y, g = u[known], field[known]
-        size = _norm(y) * _norm(g)
-        if size > 0.0:
-            sines.append(float(np.sqrt(1.0 - np.clip(y @ g / size, 0.0, 1.0) ** 2)))
-    return min(sines)
+    """Return the least sine of the angle between data (d, c) and a field; 1 if none is along it."""
+    sizes = [_norm(u) * _norm(field) for field in fields]
+    cosines = [np.sum(u * g) / size for g, size in zip(fields, sizes, strict=True) if size > 0.0]
+    return float(np.sqrt(1.0 - np.clip(max(cosines, default=0.0), 0.0, 1.0) ** 2))
 
 
 def predict_over_prior(
