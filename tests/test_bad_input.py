@@ -132,8 +132,16 @@ def folder(tmp_path_factory):
         "small": "volume\n120",
     }
     # The free end moves by 50 to 77 mm.
-    for name, sag in (("metres", 0.06), ("centimetres", 6.0), ("zero", 0.0), ("huge", 1e9)):
+    for name, sag in (
+        ("metres", 0.06),
+        ("centimetres", 6.0),
+        ("pixels", 720.0),
+        ("upside_down", -60.0),
+        ("zero", 0.0),
+        ("huge", 1e9),
+    ):
         tables[name] = "\n".join([NODES.strip(), *(f"{node},0,0,{-sag}" for node in FREE_END)])
+    tables["swapped"] = "\n".join([NODES.strip(), *(f"{node},0,-60,0" for node in FREE_END)])
     for name, text in tables.items():
         (folder / f"{name}.csv").write_text(text + "\n")
     (folder / "book.xlsx").write_bytes(b"PK")

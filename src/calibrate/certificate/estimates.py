@@ -37,8 +37,9 @@ from calibrate.certificate.evidence import LARGEST_MASS, Changes, Evidence, Figu
 from calibrate.certificate.runs import FEMRuns, least_likely
 from calibrate.importance.proposals import key_from
 from calibrate.importance.weights import effective, normalised, pareto_shape
+from calibrate.measurements.labels import datum_names
 from calibrate.posterior import Posterior
-from calibrate.posterior.diagnosis import Misfit, Sampling, places_of
+from calibrate.posterior.diagnosis import Misfit, Sampling
 from calibrate.statistical_model.errors import in_noise_sd
 from calibrate.statistical_model.pool import Pool
 from calibrate.statistical_model.predictive import Predictive
@@ -326,6 +327,5 @@ def misfits(
     misfit = {}
     for name, (unlikelier, *distances) in by_name.items():
         simulated, distance = (np.asarray(x).reshape(len(z), -1) for x in distances)
-        places = places_of(name, model.observe.shapes[name])
-        misfit[name] = Misfit.of(places, unlikelier, simulated, distance)
+        misfit[name] = Misfit.of(datum_names(model.observe, name), unlikelier, simulated, distance)
     return misfit

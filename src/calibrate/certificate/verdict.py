@@ -281,7 +281,7 @@ def _faults(evidence: Evidence) -> Iterator[Finding]:
         )
     for name, m in evidence.misfit.items():
         if not (m.p >= SMALLEST_P and m.p_worst >= SMALLEST_P_WORST):
-            named = ", ".join(f"{k} by {d:.1f} sd" for k, d in list(m.outlying.items())[:4])
+            named = "; ".join(f"{k} by {d:.1f} sd" for k, d in list(m.outlying.items())[:4])
             outlying = f"outlying data ({named}), " if named else ""
             yield (
                 f"{name} does not fit, posterior predictive p {min(m.p, m.p_worst):.3f}",

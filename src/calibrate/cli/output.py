@@ -10,6 +10,7 @@ from typing import Any
 
 from emulator.core.errors import InputError
 
+_NAMED = 4  # points that a line names
 _UNLIMITED = 1_000_000  # columns when the output is a file or a pipe
 
 
@@ -88,8 +89,7 @@ def posterior_summary(report: Mapping[str, Any]) -> str:
         )
     for name, mass in report.get("prior_cut", {}).items():
         lines.append(f"prior of {name} cut to its range: {100.0 * mass:.2g} % of its mass")
-    for name, count in report.get("missing", {}).items():
-        lines.append(f"missing values of {name} left out: {count}")
+    lines += [missing_in_words(*places) for places in report.get("missing", {}).items()]
     lines += report.get("warnings", [])
     if "log_evidence" in report:
         error = report["log_evidence_error"]
@@ -105,6 +105,13 @@ def posterior_summary(report: Mapping[str, Any]) -> str:
         lines.append(f"verdict: {report['verdict']} ({basis}): {c['reason']}")
         lines += [f"- {finding}" for finding in c["findings"] if finding != c["reason"]]
     return "\n".join(lines)
+
+
+def missing_in_words(name: str, places: Sequence[str]) -> str:
+    """Return how many points of an observation are missing, and where the first of them are."""
+    more = ", ..." if len(places) > _NAMED else ""
+    at = ", ".join(places[:_NAMED])
+    return f"points of {name} without a value, left out: {len(places)} ({at}{more})"
 
 
 def members_summary(report: Mapping[str, Any]) -> str:

@@ -17,7 +17,6 @@ from calibrate.measurements.collection import (
     PRESENT,
     Observations,
     leave_out_missing,
-    missing_values,
     observations,
 )
 from calibrate.measurements.displacements import (
@@ -90,7 +89,6 @@ __all__ = [
     "landmarks",
     "leave_out_missing",
     "length_between",
-    "missing_values",
     "nodal_displacements",
     "observations",
     "observations_from_json",

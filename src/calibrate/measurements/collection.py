@@ -132,7 +132,7 @@ class Observations:
         """
         part, shape = self.parts[name], self.shapes[name]
         if values.shape != shape:
-            missing = missing_values(self).get(name)
+            missing = int(np.prod(part.shape) - np.prod(shape))
             gaps = f", as {missing} values are missing" if missing else ""
             raise InputError(
                 f"data has shape {values.shape}; the observation expects {shape}{gaps} "
@@ -359,11 +359,3 @@ def check_some(name: str, values: np.ndarray) -> None:
     """Raise :class:`InputError` where every one of ``values`` is missing."""
     if np.isnan(values).all():
         raise InputError(f"data: every value of {name} is missing; give one, or leave {name} out")
-
-
-def missing_values(observe: Observations) -> dict[str, int]:
-    """Return the number of missing values by the observation's name, where there are any."""
-    return {
-        name: int(np.prod(observe.parts[name].shape)) - len(entries)
-        for name, entries in observe.entries.items()
-    }

@@ -65,6 +65,12 @@ class NodalDisplacements(DisplacementPoints):
     place_field = DataField("node", ("node",), where=True)
     spread = staticmethod(spread_nodes)
 
+    @property
+    def row_names(self) -> list[str]:
+        """The number of each node, and where it is."""
+        at = super().row_names
+        return [f"of node {node} {words}" for node, words in zip(self.nodes, at, strict=True)]
+
     def evaluate(self, displacement: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the displacements themselves."""
         return displacement

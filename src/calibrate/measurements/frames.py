@@ -73,7 +73,7 @@ def frame_data(
             raise InputError(
                 f"'{name}': only {int(np.isfinite(ways).sum())} of {len(ways)} lines along the "
                 f"normals of '{facet_set}' meet the surface within "
-                f"{reach:.3g} mm; is it in the mesh's place and unit?"
+                f"{reach:.3g} mm; is it of this wall, in the mesh's place and unit?"
             )
         observe[f"surface:{facet_set}{at}"], data[f"surface:{facet_set}{at}"] = part, ways
         rims = len(openings(scene.mesh.facet_set(facet_set)))

@@ -413,7 +413,7 @@ def field_doubts(
     if far > _FARTHER * most:
         yield (
             f"points of frame '{field.frames[last]}' move by {far:.3g}, what pulls them by "
-            f"{most:.3g} mm: are displacements in mm, not in pixels?"
+            f"{most:.3g} mm: are displacements in pixels? multiply by a pixel's size in mm"
         )
     for k, axis in enumerate("xy"):
         pull = pulls[:, k].sum()

@@ -22,7 +22,7 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.core.small_newton import minimise_by_newton
-from emulator.core.units import other_units
+from emulator.core.units import PIXELS, in_pixels, other_units
 from emulator.geometry.discretisation import shapes_at
 from emulator.geometry.mesh import Mesh
 
@@ -78,10 +78,10 @@ def _check_extent(mesh: Mesh, points: np.ndarray) -> None:
     # The unit in which the points' span would be closest to the body's size.
     lengths = other_units("mm").items()
     unit, factor = min(lengths, key=lambda item: abs(np.log(item[1] * span / body)))
-    raise InputError(
-        f"{len(points)} points span {span:.3g} mm, the body {body:.3g} mm: {unit} instead of mm? "
-        f"multiply their coordinates by {factor:g}"
-    )
+    advice = f"{unit} instead of mm? multiply their coordinates by {factor:g}"
+    if in_pixels("mm", body / span, factor):
+        advice = PIXELS
+    raise InputError(f"{len(points)} points span {span:.3g} mm, the body {body:.3g} mm: {advice}")
 
 
 def closest_points(

@@ -16,12 +16,17 @@ and n numbers. The second conditions keep noisy data: however large the noise, d
 corner of the prior that no draw came near. Before data is refused, predictions like it are sought
 at more draws, and by descents of :math:`\|y - g(x)\|` from the nearest of them, as a second mode
 may be small.
+
+Displacements of any size are refused where the least angle between them and a prediction has a
+sine above 0.2 and above the noise that is more than halved, and below a half, once two columns
+are swapped or a sign is reversed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from itertools import combinations
 
 import jax
 import jax.numpy as jnp
@@ -29,15 +34,17 @@ import numpy as np
 
 from calibrate.measurements.collection import Observations
 from calibrate.measurements.observation import Observation
+from calibrate.measurements.points import DisplacementPoints
 from emulator.core.errors import InputError
 from emulator.core.minimise import minimise
-from emulator.core.units import other_units
+from emulator.core.units import PIXELS, in_pixels, other_units
 
 _DRAWS = 32  # predictions at draws of the prior
 PRIOR_DRAWS = 4096  # draws whose extremes approximate the ends of a parameter's prior
 _MORE_DRAWS, _DESCENTS, _STEPS = 256, 4, 30  # effort of the search before data is refused
 _FACTOR = 2.0
 _NOISE_SD = 5.0
+_ALONG, _ASTRAY = 0.5, 0.2  # sines of the angle to a prediction: data are along it, or are not
 _OVERRULE = "check_scale=False or --no-unit-check overrules"
 
 
@@ -63,11 +70,58 @@ def check_magnitudes(
     predictions : those of :func:`predict_over_prior`, by observation.
     """
     for name, part in observe.parts.items():
-        if complaint(name, part, data[name], predictions[name], sd[name]) is None:
+
+        def fault(among: np.ndarray, name: str = name, part: Observation = part) -> str | None:
+            line = complaint(name, part, data[name], among, sd[name])
+            if line is None and isinstance(part, DisplacementPoints):
+                return _mistaken_columns(observe, name, part, data[name], among, sd[name])
+            return line
+
+        if fault(predictions[name]) is None:
             continue
         more = np.concatenate([predictions[name], _closest(predict, name, data[name], draws)])
-        if (line := complaint(name, part, data[name], more, sd[name])) is not None:
+        if (line := fault(more)) is not None:
             raise InputError(line)
+
+
+def _mistaken_columns(
+    observe: Observations,
+    name: str,
+    part: DisplacementPoints,
+    data: np.ndarray,
+    among: np.ndarray,
+    sd: float,
+) -> str | None:
+    """Return a message if displacements are along a prediction once columns are put right."""
+    known = np.isfinite(observe.filled(name, data))
+    measured = np.flatnonzero(known.any(axis=0))  # one camera sees no uz
+    whole = np.ix_(known[:, measured].all(axis=1), measured)
+    u, *fields = (observe.filled(name, values)[whole] for values in (data, *among))
+    columns = [part.values_in(*part.selection)[0].columns[k] for k in measured]
+    apart = _apart(u, fields)
+    if apart <= _ASTRAY or _norm(data) * apart <= sd * (np.sqrt(data.size) + _NOISE_SD):
+        return None
+    mended = {"all signs reversed": -u}
+    for k, column in enumerate(columns):
+        mended[f"the sign of {column} reversed"] = np.where(np.arange(len(columns)) == k, -u, u)
+    for i, k in combinations(range(len(columns)), 2):
+        order = np.arange(len(columns))
+        order[[i, k]] = k, i
+        mended[f"columns {columns[i]} and {columns[k]} swapped"] = u[:, order]
+    left, change = min((_apart(other, fields), change) for change, other in mended.items())
+    if not (left < _ALONG and _FACTOR * left < apart):
+        return None
+    return (
+        f"{name} data are {100 * apart:.0f} % off any prediction, whatever its size, and "
+        f"{100 * left:.0f} % with {change}: put the columns right ({_OVERRULE})"
+    )
+
+
+def _apart(u: np.ndarray, fields: Sequence[np.ndarray]) -> float:
+    """Return the least sine of the angle between data (d, c) and a field; 1 if none is along it."""
+    sizes = [_norm(u) * _norm(field) for field in fields]
+    cosines = [np.sum(u * g) / size for g, size in zip(fields, sizes, strict=True) if size > 0.0]
+    return float(np.sqrt(1.0 - np.clip(max(cosines, default=0.0), 0.0, 1.0) ** 2))
 
 
 def predict_over_prior(
@@ -163,9 +217,11 @@ def _guess(part: Observation, size: float, norms: np.ndarray, ratio: float) -> s
         for unit, factor in other_units(part.unit).items()
         if norms.min() / _FACTOR < factor * size < norms.max() * _FACTOR
     }
+    unit = min(fitting, key=lambda other: abs(np.log(fitting[other] / ratio)), default="")
+    if in_pixels(part.unit, ratio, fitting.get(unit)):
+        return PIXELS
     if not fitting:
         return "check their unit, and that they belong to this scene"
-    unit = min(fitting, key=lambda other: abs(np.log(fitting[other] / ratio)))
     return f"{unit} instead of {part.unit}? multiply by {fitting[unit]:g}"
 
 

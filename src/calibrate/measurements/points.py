@@ -61,6 +61,13 @@ class PointObservation(Observation):
         return (count, len(self.components)) if self.components else (count,)
 
     @property
+    def row_names(self) -> list[str]:
+        """Where each row was measured, in words that follow what was measured."""
+        if self.numbers:
+            return [f"in {self.row} {number:g}" for number in getattr(self, self.numbers)]
+        return [f"at ({x:.5g}, {y:.5g}, {z:.5g}) mm" for x, y, z in self.points + 0.0]
+
+    @property
     def selection(self) -> tuple[Any, ...]:
         """The arguments of ``of`` without the positions."""
         return tuple(getattr(self, argument) for argument in self.arguments)

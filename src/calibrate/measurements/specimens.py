@@ -71,6 +71,16 @@ class SpecimenCurves(PointObservation):
     def _measured(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the numbers (d, c) at the displacement (n, 3) mm of all nodes."""
 
+    @property
+    def row_names(self) -> list[str]:
+        """The row of each state, and its test."""
+        of = {
+            k: test and f" of test {test}"
+            for test, rows in self.states.protocols.items()
+            for k in rows
+        }
+        return [f"in row {k + 1}{of[k]}" for k in range(len(self.points))]
+
     def comparable(self, numbers: np.ndarray) -> np.ndarray:
         """Return numbers (d, c) of the states in one measure, so that two tests can be compared."""
         return numbers

@@ -15,7 +15,6 @@ This costs no evaluation and trusts the forward map; a certificate's check
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import compress
@@ -38,6 +37,7 @@ from emulator.surrogates.registry import FORWARD_MAPS
 
 # Attributes of a run, as JSON: errors of the map at its draws, and sentences on noises by default.
 MAP_ERRORS, SCALED_NOISE = "map_errors", "scaled_noise"
+DATUM_NAMES = "data"  # the names of each observation's numbers, as JSON
 MAP_MOVES = "map_moves"  # a number: the largest move of a mean by FEM in the map's place, in sd
 
 TAUGHT_AT = "taught_at"  # draws by name, as JSON, at which FEM has taught the map
@@ -369,25 +369,20 @@ class Misfit:
         )
 
 
-def places_of(name: str, shape: tuple[int, ...]) -> list[str]:
-    """Return names of an observation's data: ``displacement[1, 2]``, or ``volume`` for one."""
-    if math.prod(shape) == 1:
-        return [name]
-    return [f"{name}[{', '.join(map(str, k))}]" for k in np.ndindex(shape)]
-
-
 def misfits(tree: xr.DataTree) -> list[str]:
     """Return a sentence for each observation that does not fit; none without replicated data."""
     if "posterior_predictive" not in tree.children:
         return []
     sentences = []
     simulated = tree["posterior_predictive"].to_dataset()
+    names = json.loads(tree.attrs.get(DATUM_NAMES, "{}"))  # which older posteriors lack
     for name, data in tree["observed_data"].data_vars.items():
         replicates = simulated[name].values
         y = replicates.reshape(-1, data.size)
         if len(y) < _FEWEST or not np.isfinite(y).all() or not (y.std(axis=0) > 0.0).all():
             continue
-        misfit = misfit_of(str(name), replicates, data.values)
+        numbered = [f"number {k + 1} of {name}" for k in range(data.size)]
+        misfit = misfit_of(names.get(name, numbered), replicates, data.values)
         if misfit.p >= SMALLEST_P and misfit.p_worst > 0.0:
             continue
         worst = [f" ({place} is {d:.3g} sd off)" for place, d in misfit.outlying.items()]
@@ -399,14 +394,15 @@ def misfits(tree: xr.DataTree) -> list[str]:
     return sentences
 
 
-def misfit_of(name: str, replicates: np.ndarray, data: np.ndarray) -> Misfit:
+def misfit_of(names: Sequence[str], replicates: np.ndarray, data: np.ndarray) -> Misfit:
     """Return the misfit of data (*shape) to its replicates (chains, draws, *shape).
 
     Missing data is left out.
+
+    names : the names of the data.
     """
     present = np.isfinite(data).ravel()
     y = replicates.reshape(-1, data.size)[:, present]
     simulated, distance = np.abs(y - y.mean(axis=0)), np.abs(data.ravel()[present] - y.mean(axis=0))
     sums = [((x / y.std(axis=0)) ** 2).sum(axis=-1) for x in (simulated, distance)]
-    places = list(compress(places_of(name, data.shape), present))
-    return Misfit.of(places, sums[0] >= sums[1], simulated, distance[None])
+    return Misfit.of(list(compress(names, present)), sums[0] >= sums[1], simulated, distance[None])

@@ -17,11 +17,12 @@ import numpy as np
 import xarray as xr
 
 from calibrate.arviz import base
-from calibrate.measurements import Observation, missing_values
-from calibrate.measurements.labels import labels_of
+from calibrate.measurements import Observation
+from calibrate.measurements.labels import datum_names, labels_of, missing_places
 from calibrate.posterior import predictions
 from calibrate.posterior.box import BoxEnd, box_ends
 from calibrate.posterior.diagnosis import (
+    DATUM_NAMES,
     TAUGHT_AT,
     Summary,
     diagnose,
@@ -200,7 +201,8 @@ def provenance(model: Model, seed: int, sampler: str, options: Any) -> dict[str,
         "forward_fingerprint": model.full.fingerprint,
         "forward_error": model.error.fingerprint if model.error.terms else None,
         "observe": model.observe.to_json(),
-        "missing": missing_values(model.observe),
+        "missing": missing_places(model.observe),
+        DATUM_NAMES: {name: datum_names(model.observe, name) for name in model.observe.parts},
         "noise": {name: noise.to_json() for name, noise in model.noise.items()},
         "prior": {name: describe_distribution(d) for name, d in model.prior.items()},
         "prior_dependence": None if model.dependence is None else model.dependence.to_json(),

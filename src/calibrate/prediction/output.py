@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from calibrate.figures import BLUE, panels, save, with_unit
-from calibrate.posterior.diagnosis import places_of
+from calibrate.measurements.labels import datum_names
 from calibrate.prediction.beyond import Reach
 from calibrate.prediction.predict import Predicted
 from calibrate.state_names import in_state, split
@@ -28,7 +28,8 @@ def numbers(predicted: Predicted) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the name of each predicted number, and its unit, mean, sd and quantiles."""
     for name, row in predicted.summary().items():
         shape = row["mean"].shape
-        for label, place in zip(places_of(name, shape), np.ndindex(shape), strict=True):
+        labels = datum_names(predicted.observe, name)
+        for label, place in zip(labels, np.ndindex(shape), strict=True):
             yield label, {k: v if k == "unit" else float(v[place]) for k, v in row.items()}
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from calibrate.certificate import Certificate, examine
 from calibrate.certificate.reweighting import can_reweight, reweighted
-from calibrate.measurements import missing_values
+from calibrate.measurements.labels import missing_places
 from calibrate.posterior import Posterior, sample
 from calibrate.posterior.diagnosis import MAP_ERRORS, MAP_MOVES, ROUNDS_RECORD, SCALED_NOISE
 from calibrate.project.problem import Problem, build_model, read_problem, simulator_of, with_data
@@ -173,7 +173,7 @@ def report(run: Run, posterior: Posterior, certificate: Certificate | None) -> d
         "verdict": NOT_CERTIFIED,
         "k_hat": None,
         "prior_cut": dict(posterior.model.prior_cut),
-        "missing": missing_values(posterior.model.observe),
+        "missing": missing_places(posterior.model.observe),
         "draws": int(posterior.tree["posterior"].sizes["draw"]),
         "chains": int(posterior.tree["posterior"].sizes["chain"]),
         "warnings": posterior.warnings(),

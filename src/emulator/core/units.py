@@ -62,6 +62,19 @@ _MISTAKEN = (
 )
 """Units that are taken for one another."""
 
+PIXELS = "pixels instead of mm? multiply by the size of a pixel in mm"
+_PIXEL = 5e-4, 0.5  # mm, sizes of pixels in images of tissue
+_NEAR = 3.0  # factor within which lengths too large by about 1000 are in µm
+
+
+def in_pixels(unit: str, ratio: float, of_unit: float | None) -> bool:
+    """Return whether numbers in ``unit`` that are to be multiplied by ``ratio`` may be in pixels.
+
+    of_unit : the factor of the unit that is nearest, which numbers in that unit need exactly.
+    """
+    near = of_unit is not None and 1.0 / _NEAR < of_unit / ratio < _NEAR
+    return unit == "mm" and _PIXEL[0] < ratio < _PIXEL[1] and not near
+
 
 def other_units(unit: str) -> dict[str, float]:
     """Return the units that data in ``unit`` may be in by mistake, each with the factor to it."""

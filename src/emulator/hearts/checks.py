@@ -22,28 +22,54 @@ from emulator.hearts.surfaces import (
 from emulator.hearts.wall import Wall
 
 _MARGIN = 0.015  # of the extent, from rims: where surfaces meet, round-off decides
-_SAME = 0.01  # of the extent: surfaces nearer to each other, in the median, are one
+_OTHER_UNIT = 4.0  # ratio of extents that no two walls of one heart have
+_SAME = 0.01  # of the extent: surfaces nearer to each other, but for a tenth, are one
 _CLEARLY = 0.3  # cosine, above which a direction is clear
 _THICK = 20.0, 2.5  # mm and medians; no wall of a left ventricle is thicker than the lesser
 _THICK_SHARE = 0.02  # of the wall, above which its thick part is worth a word
 _FILLED = 0.1, 4.0  # volumes of a left ventricle's cavity over its wall's lie between
 
 
-def check_places(surfaces: Sequence[Surface]) -> None:
-    """Raise :class:`InputError` unless endocardia lie beside each other in the epicardium, last."""
+def check_places(surfaces: Sequence[Surface], *, crossing: bool = True) -> None:
+    """Raise :class:`InputError` unless endocardia lie beside each other in the epicardium, last.
+
+    crossing : whether surfaces must not cross; what is above a base plane may.
+    """
     outer = surfaces[-1]
     for one, other in combinations(surfaces, 2):
-        if np.median(distances(one.points, [other])) < _SAME * outer.extent:
+        small, large = sorted((one, other), key=lambda surface: surface.extent)
+        if _OTHER_UNIT * small.extent < large.extent:
+            raise InputError(
+                f"{small.name} is {small.extent:.3g} mm from corner to corner, {large.name} "
+                f"{large.extent:.3g} mm; give surfaces of one heart, in one unit"
+            )
+        if np.quantile(distances(one.points, [other]), 0.9) < _SAME * outer.extent:
             raise InputError(f"{one.name} and {other.name} are one surface; give one of each wall")
     for one, other, where in crossings(surfaces):
-        _refuse(one, other, where, astray(one, other, where, _MARGIN * outer.extent))
+        points = astray(one, other, where, _MARGIN * outer.extent)
+        share = len(points) / len(one.points)
+        if share > 0.5 and one is outer:
+            raise InputError(
+                f"{other.name} and {one.name} are swapped: the latter lies within the former"
+            )
+        if share > 0.9:
+            raise InputError(
+                f"{one.name} lies {where} of {other.name}: its middle is at "
+                f"{place_of(one.points.mean(axis=0))}, the other's at "
+                f"{place_of(other.points.mean(axis=0))}"
+            )
+        if len(points) and crossing:
+            raise InputError(
+                f"{one.name} crosses {other.name}: {len(points)} of its {len(one.points)} points "
+                f"are {where}, around {place_of(points.mean(axis=0))}; repair them there"
+            )
 
 
 def crossings(surfaces: Sequence[Surface]) -> Iterator[tuple[Surface, Surface, str]]:
     """Yield pairs of surfaces, the epicardium last, and where the first one must not be."""
     *inner, outer = surfaces
+    yield from ((outer, surface, "inside") for surface in inner)
     for surface in inner:
-        yield outer, surface, "inside"
         yield surface, outer, "outside"
         yield from ((surface, other, "inside") for other in inner if other is not surface)
 
@@ -59,26 +85,6 @@ def astray(surface: Surface, other: Surface, where: str, margin: float) -> np.nd
         ways = cKDTree(np.concatenate(rims), balanced_tree=False).query(points)[0]
         points = points[ways > margin]
     return points[inside(other, points) == (where == "inside")]
-
-
-def _refuse(surface: Surface, other: Surface, where: str, points: np.ndarray) -> None:
-    """Raise :class:`InputError` if there are points (k, 3) of a surface on the wrong side."""
-    share = len(points) / len(surface.points)
-    if share > 0.5 and where == "inside":
-        raise InputError(
-            f"{other.name} and {surface.name} are swapped: the latter lies within the former"
-        )
-    if share > 0.9:
-        raise InputError(
-            f"{surface.name} lies {where} of {other.name}: its middle is at "
-            f"{place_of(surface.points.mean(axis=0))}, the other's at "
-            f"{place_of(other.points.mean(axis=0))}"
-        )
-    if len(points):
-        raise InputError(
-            f"{surface.name} crosses {other.name}: {len(points)} of its {len(surface.points)} "
-            f"points are {where}, around {place_of(points.mean(axis=0))}; repair them there"
-        )
 
 
 def check_sides(left: Surface, right: Surface, outer: Surface) -> None:

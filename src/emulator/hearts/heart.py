@@ -59,6 +59,7 @@ VENTRICLES = ("both", "left")
 _MOST_CUT = 0.2  # of the epicardium's height: rims that stand further apart are no base
 _SIZE = 0.7  # of a left wall's median thickness: some 5000 quadratic nodes for a human ventricle
 _SQUARES = 1200  # of the edges' length that have the area of all surfaces: some 10 000 nodes
+_LARGE, _RODENT = 100.0, 25.0  # mm, extents of hearts that are as large as ours, and of a rat's
 _SAME = 1e-3  # of the extent: rims this flat are not cut
 
 Source = str | Path | Surface
@@ -76,7 +77,7 @@ def mesh_wall(
     base_height: float | None = None,
     base_point: Sequence[float] | None = None,
     smooth: int = 0,
-    least: float = LEAST,
+    least: float | None = None,
     unit: str = "mm",
 ) -> Wall:
     """Mesh the wall of a left ventricle, or the walls of both, with tetrahedra.
@@ -102,6 +103,7 @@ def mesh_wall(
     smooth : times of Taubin's filter on all surfaces; 10 to 30 take the steps off surfaces of
         voxels.
     least : the least thickness of the walls of both ventricles, mm; the epicardium is moved to it.
+        By default 2 mm, less of hearts below 100 mm from corner to corner.
     unit : the unit of the files, ``mm``, ``cm``, ``m`` or ``um``; other lengths are in mm.
 
     Raises
@@ -113,15 +115,17 @@ def mesh_wall(
         or for any.
     """
     _check_options(order, unit, smooth, least, ventricles, right)
-    sources = [(endocardium, BOTH[0]), (right, BOTH[1]), (epicardium, BOTH[2])]
+    first = "endocardium" if right is None else BOTH[0]
+    sources = [(endocardium, first), (right, BOTH[1]), (epicardium, BOTH[2])]
     read = [surface_in_mm(source, name, unit) for source, name in sources if source is not None]
     intact, plane, notes = _walls(read, BasePlane(axis, base_height, base_point), ventricles)
     both, is_cut = len(intact) == 3, plane != BasePlane()
     base = _below(intact, plane) if is_cut or not both else _at_valves(intact)
     *inner, outer = (smoothed(surface, smooth) for surface in base.surfaces)
     check_places([*inner, outer])
-    outside = thickened(outer, inner, least) if both else outer
-    surfaces = [*inner, without_edge(outside, inner) if both and not is_cut else outside]
+    scale = min(1.0, read[-1].extent / _LARGE)
+    outside = thickened(outer, inner, least or scale * LEAST) if both else outer
+    surfaces = [*inner, without_edge(outside, inner, scale) if both and not is_cut else outside]
     thickness = thickness_of(distances(inner[0].points, surfaces[1:]))
     area = sum(surface.mesh.area for surface in surfaces)
     usual = np.sqrt(area / _SQUARES) if both else _SIZE * thickness.median
@@ -159,6 +163,14 @@ def _walls(
     surfaces : the surfaces that were read: endocardium, or both, and epicardium.
     """
     notes: list[str] = []
+    extent = surfaces[-1].extent
+    if extent < _RODENT:
+        notes.append(
+            f"the epicardium is {extent:.3g} mm from corner to corner, as a mouse's or a rat's: if "
+            "the heart is of neither, give the files' --unit, such as cm"
+        )
+    if len(surfaces) == 3 or not _are_one(*surfaces):
+        check_places(surfaces, crossing=False)
     if len(surfaces) == 3:
         check_sides(*surfaces)
         notes += mirrored(surfaces)
@@ -190,7 +202,12 @@ def _are_one(endocardium: Surface, epicardium: Surface) -> bool:
 
 
 def _check_options(
-    order: int, unit: str, smooth: int, least: float, ventricles: str | None, right: Source | None
+    order: int,
+    unit: str,
+    smooth: int,
+    least: float | None,
+    ventricles: str | None,
+    right: Source | None,
 ) -> None:
     """Raise :class:`InputError` for options that are out of range."""
     if order not in (1, 2):
@@ -198,7 +215,7 @@ def _check_options(
     look_up(IN_MM, unit, "unit")
     if smooth < 0:
         raise InputError(f"smooth {smooth}: expected 0 times or more")
-    if not least > 0.0:
+    if least is not None and not least > 0.0:
         raise InputError(f"least {least} mm: expected a thickness above 0 mm")
     if ventricles is not None:
         look_up(dict.fromkeys(VENTRICLES), ventricles, "ventricles")

@@ -127,10 +127,12 @@ def thickened(outer: Surface, inner: Sequence[Surface], least: float) -> Surface
     return Surface(outer.name, points, outer.triangles)
 
 
-def without_edge(outer: Surface, inner: Sequence[Surface]) -> Surface:
+def without_edge(outer: Surface, inner: Sequence[Surface], scale: float) -> Surface:
     """Return the epicardium without a ring at each of its rims that meets an endocardium's rim.
 
     The ring is narrower where rims are so near to each other that little would be left between.
+
+    scale : the heart's size over that of a large one.
     """
     rims = np.vstack([surface.points[loop] for surface in inner for loop in rim_loops(surface)])
     loops = rim_loops(outer)
@@ -138,13 +140,13 @@ def without_edge(outer: Surface, inner: Sequence[Surface]) -> Surface:
     pairs = combinations(range(len(loops)), 2)
     between = [trees[k].query(outer.points[loops[other]])[0].min() for k, other in pairs]
     to_rim = cKDTree(rims, balanced_tree=False).query(outer.points)[0]
-    meeting = [loop for loop in loops if to_rim[loop].mean() < LEAST]
+    meeting = [loop for loop in loops if to_rim[loop].mean() < scale * LEAST]
     if not meeting:
         return outer
     edges, lengths = outer.mesh.edges_unique, outer.mesh.edges_unique_length
     graph = coo_array((lengths, edges.T), shape=(len(outer.points),) * 2).tocsr()
     ways = dijkstra(graph, directed=False, indices=np.concatenate(meeting), min_only=True)
-    return clipped(outer, min(_RING, _BETWEEN * min(between, default=np.inf)) - ways)
+    return clipped(outer, min(scale * _RING, _BETWEEN * min(between, default=np.inf)) - ways)
 
 
 def mesh_between(

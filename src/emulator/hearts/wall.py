@@ -155,10 +155,13 @@ def surface_in_mm(source: str | Path | Surface, name: str, unit: str) -> Surface
         surface = replace(source, name=name)
     else:
         surface = read_surface(source, name, IN_MM[unit])
-    if not _EXTENTS[0] <= surface.extent <= _EXTENTS[1]:
+    low, high = _EXTENTS
+    if not low <= surface.extent <= high:
+        size = surface.extent / IN_MM[unit]
+        fitting = [name for name, factor in IN_MM.items() if low <= factor * size <= high]
         raise InputError(
             f"{name}: it is {surface.extent:.3g} mm from corner to corner, lengths being taken as "
-            f"{unit}: give the file's own --unit, {', '.join(IN_MM)}"
+            f"{unit}: give the file's own --unit, {' or '.join(fitting) or ', '.join(IN_MM)}"
         )
     return surface
 

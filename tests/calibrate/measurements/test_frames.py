@@ -96,6 +96,13 @@ def test_by_the_command_line(scene, tmp_path, capsys):
     assert "give each as SET@STATE=FILE" in complaint(
         capsys, "frames", *built, "--surface", "late.stl", "--out", out
     )
+    twice = f"{WALL}@late={file}", f"{WALL}@late=other.stl"
+    line = complaint(capsys, "frames", *built, "--surface", *twice, "--out", out)
+    again = f"{WALL}@late={file}", f"{WALL}@later={file}"
+    assert f"'{WALL}@late' and '{WALL}@later' are one surface, {file}; each" in complaint(
+        capsys, "frames", *built, "--surface", *again, "--out", out
+    )
+    assert f"--surface '{WALL}@late' is there twice, {file} and other.stl; give one" in line
 
 
 def test_what_is_no_frame_is_refused(scene):

@@ -169,7 +169,10 @@ def test_tables_that_cannot_be_are_refused_in_a_line(tmp_path, field, make, word
     [
         (lambda f, a: (f, {k: v for k, v in a.items() if k != "9"}), "frame '9' has no amount"),
         (lambda f, a: (f, dict(zip(a, [2.0, 0.1, 1.5, 0.0, 0.7], strict=True))), "in the order"),
-        (lambda f, a: (FullField(30.0 * f.points, f.displacement, f.frames), a), "instead of mm"),
+        (
+            lambda f, a: (FullField(30.0 * f.points, f.displacement, f.frames), a),
+            "pixels instead of mm",
+        ),
         (lambda f, a: (FullField(f.points + 9.0, f.displacement, f.frames), a), "outside the body"),
         (lambda f, a: (f.only(("3", "99")), a), "no frame '99'"),
     ],
@@ -223,7 +226,7 @@ def seen(u):
     ("y", "u", "question"),
     [
         (True, lambda x, a: a * x / 4.0 * [1, 2], None),
-        (True, lambda x, a: 12.0 * a * x / 4.0 * [1, 2], "in mm, not in pixels?"),
+        (True, lambda x, a: 12.0 * a * x / 4.0 * [1, 2], "displacements in pixels?"),
         (True, lambda x, a: a * x / 4.0 * [1, -2], "move against the pull along y: does y of the"),
         (False, lambda x, a: a * (x - [0, 2]) / 4.0 * [1, -0.4], None),
         (
@@ -253,7 +256,11 @@ def test_a_place_counts_once(field):
 
 @pytest.mark.parametrize(
     ("scale", "question"),
-    [((1.0, 1.0), None), ((10.0, 10.0), "not in pixels?"), ((1.0, -1.0), "rows count down")],
+    [
+        ((1.0, 1.0), None),
+        ((10.0, 10.0), "displacements in pixels?"),
+        ((1.0, -1.0), "rows count down"),
+    ],
 )
 def test_doubts_are_said_by_the_command(cases, scale, question, tmp_path, capsys):
     folder = cases / "tables" / "two_forces"

@@ -103,6 +103,8 @@ def test_points_in_another_unit_are_refused(beam):
     """Those in metres lie inside, all at the clamp; their displacements are next to nothing."""
     points = spread_landmarks(beam, 12, 3)
     locate(beam.mesh, points[:4] * 0.5)
+    with pytest.raises(InputError, match="pixels instead of mm. multiply by the size of a pixel"):
+        locate(beam.mesh, 40.0 * points)
     for factor, unit, repair in ((1e-3, "m", "1000"), (1e3, "µm", "0.001")):
         with pytest.raises(InputError, match=f"12 points span .* {unit} instead of mm.* {repair}$"):
             locate(beam.mesh, factor * points)

@@ -52,6 +52,7 @@ def over_prior(model):
         (0.1, r"about 10 times smaller .* cm instead of mm\? multiply by 10 "),
         (1e3, r"about 1000 times larger .* µm instead of mm\? multiply by 0.001"),
         (0.0, "displacement data are all zero; predictions reach"),
+        (60.0, r"larger .* pixels instead of mm\? multiply by the size of a pixel in mm \("),
         (1e9, "times larger .* check their unit, and that they belong to this scene"),
         (1e200, "times larger"),
     ],
@@ -97,6 +98,33 @@ def test_the_smallest_and_the_largest_prediction_are_among_those_made(model, bea
     every = [np.linalg.norm(model.forward(jnp.asarray(theta))) for theta in grid]
     assert norms.min() == pytest.approx(min(every), rel=0.02)
     assert norms.max() == pytest.approx(max(every), rel=0.02)
+
+
+@pytest.mark.parametrize("pair", [(0, 1), (0, 2), (1, 2)])
+def test_columns_that_are_swapped_are_named(model, forward, exact, pair):
+    """One camera sees no z; noise as large as the signal says nothing."""
+    swapped, words = exact.copy(), f"columns u{'xyz'[pair[0]]} and u{'xyz'[pair[1]]} swapped: put"
+    swapped[:, pair] = exact[:, pair[::-1]]
+    with pytest.raises(InputError, match=words):
+        model.given(swapped)
+    if pair == (0, 1):
+        with pytest.raises(InputError, match=words):
+            model.given(np.where([True, True, False], swapped, np.nan))
+    with pytest.raises(InputError, match=f"sign of u{'xyz'[pair[1]]} reversed: put"):
+        model.given(np.where(np.arange(3) == pair[1], -exact, exact))
+    noisy = cal.model(forward, model.observe, cal.GaussianNoise(sd=np.abs(exact).max()))
+    noisy.check_data(swapped)
+
+
+def test_columns_in_order_are_taken_whatever_the_noise(model, forward):
+    """Data at draws of the prior, with a tenth, a half and all of their size as noise."""
+    rng = np.random.default_rng(5)
+    for share in (0.1, 0.5, 1.0):
+        for theta in rng.uniform(50.0, 100.0, (20, 2)):
+            u = np.asarray(forward.at(np.array(NODES))(jnp.array(theta)))
+            sd = share * np.sqrt(np.mean(u**2))
+            noisy = cal.model(forward, model.observe, cal.GaussianNoise(sd=sd))
+            noisy.check_data(u + rng.normal(0.0, sd, u.shape))
 
 
 def test_a_body_that_may_be_at_rest_explains_small_data(beam):

@@ -10,12 +10,12 @@ from scipy import stats
 import calibrate as cal
 from calibrate.measurements import (
     leave_out_missing,
-    missing_values,
     observations,
     observations_from_json,
     spread_landmarks,
 )
 from calibrate.measurements.data import read_measurements, write_data
+from calibrate.measurements.labels import missing_places
 from calibrate.noise import CorrelatedNoise
 from emulator.core.errors import InputError
 from linear_support import linear_forward
@@ -32,6 +32,9 @@ def model(beam):
 
 def predicted(model):
     return model.observe(model.forward(THETA)[None], THETA[None])["displacement"]
+
+
+WITHOUT = ["of node 30 at (0, 0, 10) mm", "of node 12 at (50, 10, 0) mm"]
 
 
 @pytest.fixture
@@ -56,7 +59,7 @@ def test_the_density_is_that_of_the_values_that_are_there(model, data):
     by_hand = np.sum(-0.5 * z**2) - 8 * np.log(0.3 * np.sqrt(2.0 * np.pi))
     found = reduced.log_density({}, predicted_there(reduced), kept)
     assert float(found) == pytest.approx(by_hand, rel=1e-12)
-    assert missing_values(reduced.observe) == {"displacement": 4}
+    assert missing_places(reduced.observe) == {"displacement": WITHOUT}
 
 
 def test_correlated_noise_loses_the_rows_and_columns_of_what_is_missing(model, data):
@@ -92,7 +95,7 @@ def test_gaps_of_one_load_state(ventricle):
     assert {name: values.shape for name, values in kept.items()} == dict(
         zip(names, ((3, 3), (8,)), strict=True)
     )
-    assert missing_values(reduced.observe) == {"displacement@high": 1}
+    assert missing_places(reduced.observe) == {"displacement@high": part.row_names[:1]}
     assert reduced.names == model.names
     thetas = reduced.states.thetas(draw)
     means = reduced.observe(reduced.evaluate(thetas).displacement, thetas)
@@ -132,7 +135,7 @@ def test_batches_sites_and_json(beam, model, data):
     assert fewer.parts["displacement"].shape == (4, 3)
     assert fewer.shapes == {"displacement": (7,)}
     np.testing.assert_array_equal(fewer.entries["displacement"], entries[1:])
-    assert missing_values(fewer) == {"displacement": 5}
+    assert missing_places(fewer) == {"displacement": ["of node 7 at (50, 5, 0) mm", *WITHOUT]}
 
 
 @pytest.mark.slow
@@ -142,7 +145,10 @@ def test_the_posterior_says_what_is_missing(model, data):
     options = NUTSOptions(warmup=50, draws=50, chains=1, rounds=1)
     posterior = cal.sample(model, data, options=options)
     tree = posterior.tree
-    assert json.loads(tree.attrs["missing"]) == {"displacement": 4}
+    assert json.loads(tree.attrs["missing"]) == {"displacement": WITHOUT}
+    names = json.loads(tree.attrs["data"])["displacement"]
+    assert len(names) == 8
+    assert names[-1].startswith("displacement z of node ")
     observed = tree["observed_data"]["displacement"]
     np.testing.assert_array_equal(observed, data[~np.isnan(data)])
     assert observed.dims == ("entry_displacement",)

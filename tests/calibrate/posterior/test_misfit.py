@@ -1,5 +1,6 @@
 """Data that could not have come from the model is told, other data is not."""
 
+import json
 import re
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 import xarray as xr
 from scipy.stats import chi2
 
-from calibrate.posterior.diagnosis import SMALLEST_P, misfit_of, misfits
+from calibrate.posterior.diagnosis import DATUM_NAMES, SMALLEST_P, misfit_of, misfits
 
 
 def tree(data, sd=1.0, correlated=False):
@@ -34,7 +35,7 @@ def test_data_of_the_model_is_not_told():
     ("change", "said"),
     [
         (lambda y: 1.6 * y, r"p 0\.000"),  # chi squared of 60 data 2.6 times too large
-        (lambda y: y + np.where(np.arange(60).reshape(20, 3) == 7, 9.0, 0.0), r"u\[2, 1\] is"),
+        (lambda y: y + np.where(np.arange(60).reshape(20, 3) == 7, 9.0, 0.0), r"number 8 of u is"),
         (lambda y: y + 500.0, r"(4|5)\d\d sd off"),
     ],
 )
@@ -46,12 +47,21 @@ def test_what_is_wrong_is_told(change, said):
     assert re.search(said, sentence)
 
 
+def test_a_datum_is_named_as_the_posterior_names_it():
+    y = np.random.default_rng(2).normal(size=(20, 3))
+    y[2, 1] += 9.0
+    names = [f"displacement {x} at ({k}, 0, 0) mm in state late" for k in range(20) for x in "xyz"]
+    named = tree(y)
+    named.attrs[DATUM_NAMES] = json.dumps({"u": names})
+    assert "(displacement y at (2, 0, 0) mm in state late is " in misfits(named)[0]
+
+
 def test_missing_data_are_left_out_and_one_number_has_no_place():
     y = np.random.default_rng(2).normal(size=(20, 3))
     y[3] = np.nan
     assert not misfits(tree(y))
     (sentence,) = misfits(tree(np.array([30.0])))
-    assert "(u is " in sentence
+    assert "(number 1 of u is " in sentence
 
 
 def test_errors_in_common_are_not_taken_for_many():
@@ -71,7 +81,7 @@ def test_p_of_the_sum_is_chi_squareds():
     rng = np.random.default_rng(3)
     replicates, y = rng.normal(size=(4, 5000, 30)), rng.normal(size=30)
     for scale in (0.7, 1.0, 1.25):
-        p = misfit_of("u", replicates, scale * y).p
+        p = misfit_of(["u"] * 30, replicates, scale * y).p
         assert p == pytest.approx(chi2.sf(scale**2 * (y @ y), 30), abs=0.015)
 
 
@@ -80,7 +90,7 @@ def test_one_outlier_among_many_is_told_by_the_largest():
     y = np.random.default_rng(4).normal(size=(2000, 1))
     y[1234] = 6.0
     replicates = tree(y)["posterior_predictive"]["u"].values
-    found = misfit_of("u", replicates, y)
+    found = misfit_of(["u"] * 2000, replicates, y)
     assert found.p > SMALLEST_P
     assert found.p_worst == 0.0
-    assert "u[1234, 0] is 6" in misfits(tree(y))[0]
+    assert "number 1235 of u is 6" in misfits(tree(y))[0]

@@ -7,7 +7,7 @@ import pytest
 
 import emulator as em
 from calibrate.cli import main
-from calibrate.measurements import missing_values
+from calibrate.measurements.labels import missing_places
 from calibrate.project import Run, read_posterior
 from calibrate.project.experiment import read_experiment
 from calibrate.project.members import Members
@@ -223,7 +223,9 @@ def test_a_run_keeps_its_systematic_errors(kept):
     run, posterior = read_posterior(kept)
     assert run.systematic["camera"]["turn"] == 1.0
     assert posterior.model.error.names[0] == "camera shift x"
-    assert missing_values(posterior.model.observe) == {"displacement": 1}
+    assert missing_places(posterior.model.observe) == {
+        "displacement": ["of node 3 at (75, 0, 0) mm"]
+    }
     assert posterior.tree.attrs["forward_error"] == posterior.model.error.fingerprint
 
 

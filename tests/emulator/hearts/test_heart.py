@@ -156,7 +156,7 @@ def bad(flat):
     yield (twice, right, outer), {}, "it has 3 openings, the smallest of"
     yield (left, moved(right, [-12.0, 0.0, 0.0]), outer), {}, "crosses"
     yield (moved(left, [0.0, 14.0, 0.0]), right, outer), {}, "crosses"
-    yield (moved(left, 400.0), right, outer), {}, "no opening of the epicardium is at its opening"
+    yield (moved(left, 400.0), right, outer), {}, "lv_endocardium lies outside of epicardium"
     small = [Surface(e.name, e.points / 1000.0, e.triangles) for e in flat]
     yield small, {}, "mm from corner to corner, lengths being taken as mm"
     yield flat, {"unit": "feet"}, "unit 'feet'"
@@ -226,7 +226,7 @@ def test_every_frame_of_a_real_heart_is_meshed(measured):
         for cavity, own in found.cavities.values():
             assert cavity == pytest.approx(own, rel=6e-3)
         assert found.wall[0] == pytest.approx(found.wall[1], abs=2.0)  # mL, of thin walls and rims
-        assert found.moved < 1.5
+        assert found.shift < 1.5
         assert found.quality.angle > 3.0
         assert found.quality.parts == 1
         walls.append(found.wall[0])
@@ -244,6 +244,53 @@ def test_two_endocardia_that_are_swapped_are_refused(flat, tmp_path, capsys):
         assert (
             "lv_endocardium and rv_endocardium are swapped: the left ventricle is the round" in line
         )
+
+
+LEFT, RIGHT, OUTSIDE = "LV_ENDOCARDIAL", "RV_ENDOCARDIAL", "EPICARDIAL"
+MIXED_UP = [
+    ((LEFT, LEFT, OUTSIDE), "lv_endocardium and rv_endocardium are one surface; give one of each"),
+    ((LEFT, OUTSIDE, OUTSIDE), "rv_endocardium and epicardium are one surface; give one of each"),
+    ((OUTSIDE, RIGHT, LEFT), "lv_endocardium and epicardium are swapped: the latter lies within"),
+    ((LEFT, OUTSIDE, RIGHT), "rv_endocardium and epicardium are swapped: the latter lies within"),
+    ((OUTSIDE, None, LEFT), "endocardium and epicardium are swapped: the latter lies within"),
+]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("more", [[], ["--ventricles", "left"]])
+@pytest.mark.parametrize(("names", "said"), MIXED_UP)
+def test_walls_that_are_mixed_up_are_named(names, said, more, measured, tmp_path, capsys):
+    words = ["mesh", "--out", tmp_path / "heart.vtu"]
+    for option, name in zip(("--endocardium", "--right", "--epicardium"), names, strict=True):
+        words += [option, measured / "human_heart" / f"{name}_000.obj"] if name else []
+    assert complaint(capsys, *words, *(more if names[1] else [])).startswith(f"calibrate: {said}")
+
+
+def scaled(folder, each, factor):
+    return write(folder / f"{each.name}.stl", factor * each.points[each.triangles])
+
+
+def test_centimetres_and_metres_are_asked_about(flat, tmp_path, capsys):
+    needs_gmsh()
+    options = "--endocardium", "--right", "--epicardium"
+
+    def words(*factors):
+        files = [scaled(tmp_path, *of) for of in zip(flat, factors, strict=True)]
+        pairs = zip(options, files, strict=True)
+        return ["mesh", "--out", tmp_path / "heart.vtu", *(w for pair in pairs for w in pair)]
+
+    line = complaint(capsys, *words(0.001, 0.001, 0.001))
+    assert line.endswith("lengths being taken as mm: give the file's own --unit, m")
+    line = complaint(capsys, *words(1.0, 0.1, 1.0))
+    assert "rv_endocardium is " in line
+    assert "give surfaces of one heart, in one unit" in line
+    # What is meshed in millimetres is meshed in centimetres, too, its walls no thicker, and asked.
+    code, large = answer(capsys, *words(1.0, 1.0, 1.0))
+    code, small = answer(capsys, *words(0.1, 0.1, 0.1))
+    assert code == 0
+    assert any("as a mouse's or a rat's: if" in line for line in small["warnings"])
+    assert large["warnings"] == []
+    assert 1000.0 * small["wall"]["mesh"] == pytest.approx(large["wall"]["mesh"], rel=0.02)
 
 
 def test_valves_tell_a_mirrored_heart(measured):

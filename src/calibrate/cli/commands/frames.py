@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calibrate.cli import words
-from calibrate.cli.output import table
+from calibrate.cli.output import missing_in_words, table
 from calibrate.cli.words import Answer, command, option
 from emulator.core.errors import InputError
 from emulator.core.store import check_folder
@@ -62,7 +62,9 @@ def frames(arguments: Namespace) -> Answer:
     """Measure the surfaces or read the full field, and write the data."""
     import numpy as np
 
+    from calibrate.measurements.collection import leave_out_missing
     from calibrate.measurements.data import write_data
+    from calibrate.measurements.labels import missing_places
 
     check_folder(Path(arguments.out).parent)
     if bool(arguments.field) is bool(arguments.surface):
@@ -70,16 +72,18 @@ def frames(arguments: Namespace) -> Answer:
     measure = _full_field if arguments.field else _surfaces
     observe, data, known, doubts = measure(words.scene_of(arguments), arguments)
     write_data(arguments.out, observe, data, known)
+    missing = missing_places(leave_out_missing(observe, data)[0])
     result = {
         name: {
             "mean": float(np.mean(values[np.isfinite(values)])),
             "sd": float(np.std(values[np.isfinite(values)])),
-            "missing": int(np.isnan(values).sum()),
+            "missing": len(missing.get(name, ())),
         }
         for name, values in data.items()
     }
     rows = [(n, f"{of['mean']:.4g}", f"{of['sd']:.3g}", of["missing"]) for n, of in result.items()]
     lines = [table(("data", "mean (mm, mL, N)", "sd", "missing"), rows)]
+    lines += [missing_in_words(*places) for places in missing.items()]
     lines += [*doubts, *([_THICKNESS] if arguments.force else ()), f"written to {arguments.out}"]
     return Answer({"out": arguments.out, "data": result, "warnings": doubts}, "\n".join(lines))
 
@@ -93,6 +97,8 @@ _Measured = tuple[Any, dict[str, Any], dict[str, float], list[str]]
 
 
 def _surfaces(scene: Scene, arguments: Namespace) -> _Measured:
+    import numpy as np
+
     from calibrate.measurements.frame_checks import frame_doubts
     from calibrate.measurements.frames import frame_data
     from calibrate.state_names import states_of
@@ -105,11 +111,22 @@ def _surfaces(scene: Scene, arguments: Namespace) -> _Measured:
     surfaces = {}
     for word in arguments.surface:
         name, equals, path = word.partition("=")
-        if not (name and equals and path) or name in surfaces:
+        if not (name and equals and path):
             raise InputError(
                 f"--surface '{word}'; give each as SET@STATE=FILE, such as lv_endocardium@es=lv.obj"
             )
+        if name in surfaces:
+            paths = [
+                one.partition("=")[2] for one in arguments.surface if one.startswith(f"{name}=")
+            ]
+            raise InputError(f"--surface '{name}' is there twice, {' and '.join(paths)}; give one")
         surfaces[name] = read_surface(path, name, IN_MM[arguments.unit])
+        for other, before in surfaces.items():
+            if other != name and np.array_equal(before.points, surfaces[name].points):
+                raise InputError(
+                    f"--surface '{other}' and '{name}' are one surface, {path}; each frame and "
+                    "wall has its own"
+                )
     observe, data = frame_data(scene, surfaces, arguments.points)
     return observe, data, {}, [*frame_doubts(scene.mesh, surfaces, observe, data)]
 
