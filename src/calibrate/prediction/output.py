@@ -13,7 +13,7 @@ import xarray as xr
 
 from calibrate.figures import BLUE, panels, save, with_unit
 from calibrate.measurements.labels import datum_names
-from calibrate.prediction.beyond import Reach
+from calibrate.prediction.beyond import Beyond
 from calibrate.prediction.predict import Predicted
 from calibrate.state_names import in_state, split
 from emulator.core.store import write_json, write_netcdf
@@ -33,23 +33,39 @@ def numbers(predicted: Predicted) -> Iterator[tuple[str, dict[str, Any]]]:
             yield label, {k: v if k == "unit" else float(v[place]) for k, v in row.items()}
 
 
-def as_json(predicted: Predicted, reach: list[Reach]) -> dict[str, Any]:
-    """Return all but the draws as plain JSON."""
+def as_json(predicted: Predicted, beyond: Beyond, outer: Predicted) -> dict[str, Any]:
+    """Return all but the draws as plain JSON.
+
+    outer : the prediction with what laws miss beyond the data.
+    """
     return {
         "scene": predicted.scene.name,
         "draws": len(predicted.thetas),
         "sources": dict(predicted.sources),
-        "numbers": dict(numbers(predicted)),
+        "numbers": {
+            name: row | {f"outer_{key}": further[key] for key in ("low", "high")}
+            for (name, row), (_, further) in zip(numbers(predicted), numbers(outer), strict=True)
+        },
         "fem_runs": predicted.runs,
         "failed": predicted.failed,
         "missed_sd": predicted.missed,
-        "beyond": [asdict(one) for one in reach],
+        "beyond": [asdict(one) for one in beyond.reaches],
+        "distances": {state: np.asarray(d).tolist() for state, d in beyond.distances.items()},
         "warnings": predicted.warnings,
     }
 
 
-def write(predicted: Predicted, result: dict[str, Any], folder: Path) -> list[str]:
-    """Write draws, numbers, bands and fields into ``folder``; return the files' names."""
+def write(
+    predicted: Predicted,
+    beyond: Beyond,
+    outer: Predicted,
+    result: dict[str, Any],
+    folder: Path,
+) -> list[str]:
+    """Write draws, numbers, bands and fields into ``folder``; return the files' names.
+
+    outer : the prediction with what laws miss beyond the data.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     arrays = {
         name: xr.DataArray(
@@ -62,7 +78,7 @@ def write(predicted: Predicted, result: dict[str, Any], folder: Path) -> list[st
     unknowns = {f"draw of {name}": ("draw", values) for name, values in predicted.draws.items()}
     write_netcdf(folder / PREDICTION, xr.Dataset(arrays | unknowns))
     write_json(folder / "prediction.json", result)
-    bands(predicted, folder / "bands.png")
+    bands(predicted, beyond, outer, folder / "bands.png")
     files = [PREDICTION, "prediction.json", "bands.png"]
     if isinstance(predicted.scene, Scene):
         files += [write_fields(predicted, k, folder) for k in range(predicted.thetas.shape[1])]
@@ -81,19 +97,27 @@ def write_fields(predicted: Predicted, state: int, folder: Path) -> str:
     return file
 
 
-def bands(predicted: Predicted, path: Path) -> None:
-    """Draw band and median of each observation, over its load states or its numbers."""
+def bands(predicted: Predicted, beyond: Beyond, outer: Predicted, path: Path) -> None:
+    """Draw band and median of each observation, over its load states or its numbers.
+
+    The band with what laws miss beyond the data is hatched.
+    """
     by_kind: dict[str, list[str]] = {}
     for name in predicted.values:
         by_kind.setdefault(split(name)[0], []).append(name)
     figure, grid = panels(len(by_kind), 2, (4.2, 3.0))
-    summary = predicted.summary()
+    inner, further = predicted.summary(), outer.summary()
     for axes, (kind, names) in zip(np.ravel(grid), by_kind.items(), strict=False):
-        low, median, high = (
-            np.concatenate([np.ravel(summary[name][key]) for name in names])
-            for key in ("low", "median", "high")
-        )
+        low, median, high, least, most = (
+            np.concatenate([np.ravel(of[name][key]) for name in names])
+            for of, key in (
+                (inner, "low"), (inner, "median"), (inner, "high"),
+                (further, "low"), (further, "high"),
+            )
+        )  # fmt: skip
         x = np.arange(len(median))
+        if not np.array_equal(most, high):
+            axes.fill_between(x, least, most, fc="none", hatch="///", ec=BLUE, lw=0.5, alpha=0.5)
         axes.fill_between(x, low, high, color=BLUE, alpha=0.25, lw=0)
         axes.plot(x, median, "o-", color=BLUE, ms=3, lw=1.2)
         if len(names) == len(median):
@@ -102,5 +126,8 @@ def bands(predicted: Predicted, path: Path) -> None:
         else:
             axes.set_xlabel("number")
         axes.set_ylabel(with_unit(kind, predicted.observe.parts[names[0]].unit))
-    figure.suptitle(f"{predicted.scene.name}: 90 % band of {len(predicted.thetas)} draws")
+    title = f"{predicted.scene.name}: 90 % band of {len(predicted.thetas)} draws"
+    if any(np.any(distance) for distance in beyond.distances.values()):
+        title += "\nhatched: with what laws miss beyond the data"
+    figure.suptitle(title)
     save(figure, path)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, cast
@@ -33,7 +32,6 @@ from calibrate.state_names import split
 from calibrate.statistical_model.errors import NOT_ASKED, map_errors
 from emulator.core.display import Stages
 from emulator.core.errors import InputError
-from emulator.core.rooms import offered
 from emulator.core.store import write_json
 from emulator.fem import Simulator
 from emulator.scenes.scene import Scene
@@ -85,9 +83,6 @@ def infer(
             forward = taught_map(problem, keep=solutions, deadline=deadline, progress=progress)
             model, data = build_model(problem, forward, progress=progress)
         sampler, options = problem.run.sampling()
-        for long_table in offered("calibrate.project.specimen", "long_table") if progress else ():
-            for note in long_table(problem.scene):
-                print(note, file=sys.stderr, flush=True)
         with stages("sampling"):
             posterior = sample(
                 model,

@@ -10,7 +10,7 @@ import calibrate as cal
 import emulator as em
 from calibrate.cli import main
 from calibrate.prediction import Learned, predict_on
-from calibrate.prediction.beyond import _measures, reaches
+from calibrate.prediction.beyond import Beyond, _measures, how_far_beyond, widened
 from calibrate.samplers.laplace import LaplaceOptions
 from emulator.core.errors import InputError, SolverError
 from emulator.fem.campaign import workers
@@ -127,16 +127,58 @@ def test_fem_that_fails_is_named(posterior, shorter, monkeypatch):
 def test_a_larger_load_reaches_beyond_the_data(posterior, beam):
     """The body of the data itself does not; one that is pulled further does."""
     learned = Learned.of(posterior)
-    own = reaches(learned, beam, posterior.model.full, ("",), posterior.thetas()[:, None])
-    assert {one.measure for one in own} == {"I1"}
-    assert all(one.share == 0.0 for one in own)
+    own = how_far_beyond(learned, beam, posterior.model.full, ("",), posterior.thetas()[:, None])
+    assert {one.measure for one in own.reaches} == {"I1"}
+    assert all(one.share == 0.0 for one in own.reaches)
+    assert own.distances[""] < 0.01
     pulled = replace(beam, loads=(em.loads.Traction("right", (0.0, 0.0, -4.0)),))
     forward = em.Simulator(pulled)
-    (far,) = reaches(learned, pulled, forward, ("p1",), posterior.thetas()[:4, None])
+    beyond = how_far_beyond(learned, pulled, forward, ("p1",), posterior.thetas()[:4, None])
+    (far,) = beyond.reaches
     assert far.share > 0.2
     assert far.reached[1] > far.learned[1]
     assert "% of the body lies beyond" in str(far)
     assert far.learned[0] <= 3.0
+    assert 0.1 < beyond.distances["p1"] < 2.0
+    assert str(beyond).startswith(f"beyond the data by {beyond.distances['p1']:.2g} in p1 (log")
+
+
+def test_distance_is_of_strain_over_the_datas_and_widens_what_differs_from_rest(predicted):
+    """A piece pulled to 1.2 that goes on to 1.5, whose I1 - 3 is known by hand."""
+    columns = {"stretch_x": np.array([1.0, 1.2])}
+    law, parameter = em.find_law("neo_hookean_split"), em.Parameter("mu", "kPa", 1.0, 9.0)
+    seen, further = (
+        em.specimen(
+            columns | {"stretch_x": x}, law=law, parameters=(parameter,), constants={"kappa": 1e4}
+        )
+        for x in (np.array([1.0, 1.2]), np.array([1.1, 1.5]))
+    )
+    forward = em.homogeneous(seen, incompressible=True)
+    learned = Learned(seen, {"mu": np.ones(4)}, {}, [(forward, seen.centre[None])])
+    thetas = further.centre[None, None]
+    beyond = how_far_beyond(
+        learned, further, em.homogeneous(further, incompressible=True), ("",), thetas
+    )
+    strain = [x**2 + 2.0 / x - 3.0 for x in (1.2, 1.5)]
+    far = 0.5 * np.log(strain[1] / strain[0])
+    np.testing.assert_allclose(beyond.distances[""], [0.0, far], rtol=1e-5)
+    assert str(Beyond([], {"": np.zeros(2)})) == ""
+    outer = widened(predicted, Beyond([], {"": np.array(0.3)}))
+    for before, after in zip(predicted.values.values(), outer.values.values(), strict=True):
+        factor = after / np.where(before == 0.0, 1.0, before)
+        logs = np.log(factor[np.abs(before) > 1e-9].reshape(len(before), -1))
+        np.testing.assert_allclose(logs, logs[:, :1] * np.ones(logs.shape[1]), atol=1e-9)
+        assert logs[:, 0].std() == pytest.approx(0.3, rel=0.15)
+    same = widened(predicted, Beyond([], {"": np.array(0.0)}))
+    np.testing.assert_allclose(same.values["displacement"], predicted.values["displacement"])
+    volume = cal.CavityVolume(em.scenes.left_ventricle(3, 6, 1))
+    nothing = float(volume(np.zeros((len(volume.nodes), 3)), np.zeros(5)))
+    filled = replace(
+        predicted, observe=cal.measurements.observations(volume),
+        values={"volume": np.full(200, nothing + 10.0)}, thetas=np.zeros((200, 1, 5)),
+    )  # fmt: skip
+    wide = widened(filled, Beyond([], {"": np.array(0.3)})).values["volume"] - nothing
+    assert np.log(wide / 10.0).std() == pytest.approx(0.3, rel=0.15)
 
 
 def test_measures_of_a_pulled_block_are_those_of_its_gradient():

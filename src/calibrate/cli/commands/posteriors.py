@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 from argparse import ArgumentParser, Namespace
 from dataclasses import asdict
@@ -14,6 +15,7 @@ from calibrate.cli.output import check_plotly, members_summary, posterior_summar
 from calibrate.cli.run_words import run_options
 from calibrate.cli.words import Answer, command, flag, option, seconds
 from emulator.core.errors import InputError
+from emulator.core.rooms import offered
 from emulator.core.store import check_folder
 
 if TYPE_CHECKING:
@@ -72,6 +74,9 @@ def infer(arguments: Namespace) -> Answer:
         raise InputError(
             f"--warmup has no effect with sampler '{sampler.name}', which does not adapt"
         )
+    for long_table in offered("calibrate.project.specimen", "long_table") if progress else ():
+        for note in long_table(problem.scene):
+            print(note, file=sys.stderr, flush=True)
     posterior = infer(
         problem,
         folder,

@@ -77,7 +77,7 @@ def _on_another_scene(arguments: Namespace) -> Answer:
     """Predict another scene by the draws of a posterior, or of several laws'."""
     from calibrate.measurements import parse_observation
     from calibrate.prediction import output, predict_on
-    from calibrate.prediction.beyond import reaches
+    from calibrate.prediction.beyond import how_far_beyond, widened
     from calibrate.prediction.several import mixture, table_of
     from calibrate.prediction.transfer import made_of
     from calibrate.state_names import split
@@ -117,19 +117,20 @@ def _on_another_scene(arguments: Namespace) -> Answer:
         predicted.warnings.extend(weights.warnings)
         laws = {name: learned.scene.law.name for name, learned in bodies.items()}
         result = {"posterior": verdicts, "laws": table_of(weights, laws)}
-    reach = reaches(
+    beyond = how_far_beyond(
         bodies[chosen],
         predicted.scene,
         predicted.forward,
         predicted.observe.states,
         predicted.thetas,
     )
-    result |= output.as_json(predicted, reach)
+    outer = widened(predicted, beyond, seed)
+    result |= output.as_json(predicted, beyond, outer)
     if several:
         result["by_law"] = {name: dict(output.numbers(p)) for name, p in predictions.items()}
     text = bands_summary(result)
     if folder is not None:
-        result["files"] = output.write(predicted, result, folder)
+        result["files"] = output.write(predicted, beyond, outer, result, folder)
         text += f"\nwritten to {folder}: {', '.join(result['files'])}"
     return Answer(result, text, not predicted.warnings)
 
@@ -158,12 +159,15 @@ def _learned(runs: list[str]) -> tuple[dict[str, Learned], dict[str, str], Weigh
 
 def bands_summary(result: dict[str, Any]) -> str:
     """Return :func:`calibrate.prediction.output.as_json` as text."""
-    from calibrate.prediction.beyond import Reach
+    from calibrate.prediction.beyond import Beyond, Reach
 
-    keys = ("unit", "mean", "sd", "low", "median", "high")
+    columns = {"unit": "unit", "mean": "mean", "sd": "sd", "low": "5 %", "median": "50 %"}
+    columns["high"], beyond = "95 %", str(Beyond([], result["distances"]))
+    if beyond:
+        columns |= {"outer_low": "outer 5 %", "outer_high": "95 %"}
     shown = list(result["numbers"].items())
-    rows = [[name, *(row[key] for key in keys)] for name, row in shown[:_ROWS]]
-    lines = [table(("prediction", "unit", "mean", "sd", "5 %", "50 %", "95 %"), rows)]
+    rows = [[name, *(row[key] for key in columns)] for name, row in shown[:_ROWS]]
+    lines = [table(("prediction", *columns.values()), rows)]
     if len(shown) > _ROWS:
         lines.append(f"and {len(shown) - _ROWS} more numbers")
     by_source: dict[str, list[str]] = {}
@@ -178,7 +182,7 @@ def bands_summary(result: dict[str, Any]) -> str:
     every = result["fem_runs"] >= result["draws"]
     lines.append(f"{result['draws']} draws, {'each of them solved' if every else others}")
     lines += [str(Reach(**one)) for one in result["beyond"] if one["share"] > 0.0]
-    return "\n".join([*lines, *result["warnings"]])
+    return "\n".join([*lines, *filter(None, [beyond]), *result["warnings"]])
 
 
 def _laws_summary(result: dict[str, Any]) -> list[str]:
