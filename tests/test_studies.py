@@ -24,6 +24,7 @@ QUICK = {
     "accuracy_vs_time": "--quick",
     "beam_coverage": "PUBLISHED --cases 2",
     "biaxial": "--quick",
+    "blind": "--data MEASURED --quick",
     "blood_clots": "--data MEASURED/blood_clots --quick",
     "certificate": "--quick",
     "fem_speed": "--quick",
