@@ -23,6 +23,7 @@ from calibrate.measurements import Observation, Observations, observations
 from calibrate.noise import GaussianNoise
 from calibrate.posterior import Posterior
 from calibrate.prediction.transfer import Learned, Transfer, transfer
+from calibrate.project import simulator_of
 from calibrate.state_names import in_state
 from calibrate.statistical_model import FEMLikelihood, Model
 from calibrate.statistical_model.fem_likelihood import runs_of
@@ -32,7 +33,6 @@ from emulator.core.display import counting
 from emulator.core.errors import InputError, SolverError
 from emulator.core.machine import one_blas_thread
 from emulator.core.rooms import offered
-from emulator.fem import NewtonOptions, Simulator
 from emulator.fem.campaign import Field
 from emulator.scenes.forward_problem import ForwardProblem
 from emulator.scenes.scene import Scene
@@ -128,7 +128,7 @@ def predict_on(
     thetas = target.states.thetas(target.draws)
     if not isinstance(target.scene, Scene):
         return _of_states(learned, target, several, thetas)
-    simulator = Simulator(target.scene, NewtonOptions.load_steps(load_steps))
+    simulator = simulator_of(target.scene, load_steps)
     kept: dict[bytes, Field] = {}
     at_rest = Emulator(target.scene).cache()
     with one_blas_thread(), counting(

@@ -74,17 +74,13 @@ def weights_of(trees: Mapping[str, xr.DataTree]) -> Weights:
 
     :class:`InputError` for fewer than two, for different data, or without log likelihoods.
     """
-    models = compare(trees).models
-    stacking = {model.name: model.weight for model in models}
-    evidence = None
-    if (logs := [m.log_evidence for m in models if m.log_evidence is not None]) == [
-        m.log_evidence for m in models
-    ]:
-        shares = normalised(np.array(logs))
-        evidence = {m.name: float(w) for m, w in zip(models, shares, strict=True)}
-    return Weights(
-        {name: stacking[name] for name in trees}, evidence and {n: evidence[n] for n in trees}
-    )
+    models = {model.name: model for model in compare(trees).models}
+    stacking = {name: models[name].weight for name in trees}
+    logs = [models[name].log_evidence for name in trees]
+    if None in logs:
+        return Weights(stacking, None)
+    shares = normalised(np.array(logs)).tolist()
+    return Weights(stacking, dict(zip(trees, shares, strict=True)))
 
 
 def mixture(

@@ -140,14 +140,16 @@ class FEMLikelihood:
         for draw in [draw for draw, fields in solutions.items() if len(fields) == states]:
             fields = solutions.pop(draw)
             yield draw, [fields[k] for k in range(states)]
-        # A draw that fails in one load state is done: its other states are not begun.
+        # A draw that fails in one load state is done: its other states are not solved.
         numbers = (
             k
             for k in range(len(thetas))
             if k // states in solutions and k % states not in solutions[k // states]
         )
         again = self.kept is not None
-        solver = Solver(self.simulator, sensitivities=slopes, from_rest_again=again)
+        solver = Solver(
+            self.simulator, sensitivities=slopes, from_rest_again=again, together=states
+        )
         nearest, near = self._kept_beside(thetas)
         # Not under jit: there the solver cannot use CHOLMOD, which is faster.
         for row in solve_rows(

@@ -104,11 +104,14 @@ class NewtonOptions:
             )
 
     @classmethod
-    def load_steps(cls, steps: int) -> NewtonOptions:
-        """Return options that follow the loading path in ``steps`` equal or smaller increments."""
+    def load_steps(cls, steps: int, most: int = 300) -> NewtonOptions:
+        """Return options that follow the loading path in ``steps`` equal or smaller increments.
+
+        most : the most iterations, or 20 for each step.
+        """
         if steps < 1:
             raise InputError(f"{steps} load steps; give 1 or more")
-        return cls(increment=1.0 / steps, max_iterations=max(cls.max_iterations, 20 * steps))
+        return cls(increment=1.0 / steps, max_iterations=max(most, 20 * steps))
 
 
 class Step(NamedTuple):

@@ -205,6 +205,13 @@ def test_a_further_load_state_is_all_that_is_solved_at_earlier_draws(tmp_path, m
     assert _read(tmp_path / "old.safetensors", metadata["of"])[1] == {}
 
 
+def test_a_solve_at_a_draw_ends_sooner_than_one_for_its_own_sake(beam):
+    """One far out in a prior takes as long as a hundred others; with load steps it may be longer."""
+    most = [simulator_of(beam, steps).options.max_iterations for steps in (1, 4, 10)]
+    assert most == [100, 100, 200]
+    assert em.Simulator(beam).options.max_iterations == 300
+
+
 def test_fem_that_fails_in_a_third_of_the_prior_costs_runs_and_nothing_else(monkeypatch):
     """Bodies softer than 50 kPa, 29 % of the prior of mu, have no equilibrium."""
     solve = workers.Solver.__call__

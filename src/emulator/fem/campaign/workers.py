@@ -82,12 +82,15 @@ class Solver:
         ventricle with five parameters.
     energy : compute the potential energy; :class:`InputError` for a scene without one.
     from_rest_again : solve a second time, from rest, where a start fails.
+    together : the number of tasks, one after the other, of which none is of use if one fails, as of
+        the load states of one draw: those that are not begun then fail unsolved.
     """
 
     simulator: EquilibriumSolver
     sensitivities: bool = False
     energy: bool = False
     from_rest_again: bool = True
+    together: int = 1
 
     def __post_init__(self) -> None:
         if self.energy:
@@ -96,9 +99,13 @@ class Solver:
     def __call__(self, task: Task) -> Row:
         """Return the row of ``task``; a solve that fails is a row with that status."""
         began, theta = time.perf_counter(), jnp.asarray(task.theta)
+        if task.number // self.together in self._lost:
+            task, theta = task._replace(starts=()), jnp.full_like(theta, jnp.nan)
         solution = self.simulator.solve(theta, self._start(task.starts, theta))
         if task.starts and self.from_rest_again and not solution.converged:
             solution = self.simulator.solve(theta)
+        if self.together > 1 and not solution.converged:
+            self._lost.add(task.number // self.together)
         energy = jnp.asarray(jnp.nan)
         if self.energy and solution.converged:
             energy = self._energy(solution.displacement, theta)
@@ -125,6 +132,11 @@ class Solver:
             assert isinstance(self.simulator, Simulator)
             return _best(self.simulator.system, stacked, theta)
         return jnp.asarray(starts[0]) if starts else None
+
+    @cached_property
+    def _lost(self) -> set[int]:
+        """Numbers of what has a task that failed."""
+        return set()
 
     @cached_property
     def _energy(self):  # noqa: ANN202 - a compiled program, private

@@ -8,6 +8,7 @@ import pytest
 import emulator as em
 from emulator.core.errors import SolverError
 from emulator.fem import run_campaign, sobol
+from emulator.fem.campaign import workers
 from emulator.fem.solution import Status
 from emulator.scenes.loads import Gravity
 from emulator.surrogates.taylor import constant, expand
@@ -102,6 +103,19 @@ def test_where_a_start_fails_rest_is_tried(simulator, thetas, monkeypatch):
     assert starts[0] is None  # the others, on threads of their own, in any order
     assert sorted(start is None for start in starts[1:]) == [False, False, True, True]
     assert jnp.isfinite(runs.displacement).all()
+
+
+def test_states_of_a_draw_that_has_failed_are_not_solved(simulator, thetas):
+    """The second state of the first draw fails unsolved, those of the next are solved."""
+    solver = workers.Solver(simulator, together=2)
+    tasks = [np.full_like(thetas[0], np.nan), thetas[0], thetas[0], thetas[1]]
+    rows = [solver(workers.Task(k, theta)) for k, theta in enumerate(tasks)]
+    assert [row.converged for row in rows] == [False, False, True, True]
+    assert [int(row.solution.iterations) for row in rows][:2] == [0, 0]
+    alone = workers.Solver(simulator)
+    assert [alone(workers.Task(k, theta)).converged for k, theta in enumerate(tasks[:2])] == [
+        False, True,
+    ]  # fmt: skip
 
 
 def test_a_failure_names_the_run(simulator, thetas):
