@@ -45,9 +45,8 @@ from emulator.surrogates.protocol import ForwardMap, Ingredients
 def simulator_of(scene: ForwardProblem, load_steps: int = 1) -> EquilibriumSolver:
     """Return the simulator of ``scene``, which the scene keeps; a specimen is solved by its law.
 
-    Synthetic data, forward map, certificate and report share it: it takes longer to compile than
-    to solve once. Of 581 hard cases that converge 576 take fewer iterations than its most; one that
-    does not, far out in a prior, takes as long as a hundred others.
+    Synthetic data, forward map, certificate and report share it and what it compiles. Of 581 hard
+    cases that converge 576 take fewer iterations than its most; one that does not takes minutes.
     """
     if isinstance(scene, Scene):
         return Simulator(scene, NewtonOptions.load_steps(load_steps, most=100))

@@ -105,9 +105,9 @@ class NewtonOptions:
 
     @classmethod
     def load_steps(cls, steps: int, most: int = 300) -> NewtonOptions:
-        """Return options that follow the loading path in ``steps`` equal or smaller increments.
+        """Return options that follow the loading path in ``steps`` increments, or smaller ones.
 
-        most : the most iterations, or 20 for each step.
+        most : the most iterations, or 20 a step if that is more.
         """
         if steps < 1:
             raise InputError(f"{steps} load steps; give 1 or more")
