@@ -171,7 +171,9 @@ def draw(summary: Case, path: Path) -> None:
     axis.set_yticks(np.arange(len(bands)) + 0.2, bands)
     axis.set(xlabel="share of held points inside of a 90 % band", xlim=(0.0, 1.0))
     axis.invert_yaxis()
-    axis.legend(frameon=False, title="motion over the data's", fontsize=8, title_fontsize=8)
+    axis.legend(
+        frameon=False, title="motion over the data's", loc="upper left", bbox_to_anchor=(1.0, 1.0)
+    )
     save(figure, path)
 
 

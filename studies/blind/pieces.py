@@ -68,7 +68,7 @@ class Piece:
         for test in dict.fromkeys(self.tests):
             of = tests == test
             seen[of] = motion[of] <= share * motion[of].max() + 1e-9
-            ratio[of] = motion[of] / motion[of & seen].max(initial=np.nan)
+            ratio[of] = motion[of] / motion[of & seen].max(initial=0.0)
         return seen, ratio
 
     def write(self, path: Path, rows: np.ndarray) -> None:
