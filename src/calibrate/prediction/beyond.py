@@ -144,8 +144,9 @@ def widened(predicted: Predicted, beyond: Beyond, seed: int = 0) -> Predicted:
     values = {}
     for name, y in predicted.values.items():
         distance = np.asarray(beyond.distances[split(name)[1]])
-        sizes = distance.reshape(*distance.shape, *[1] * (y.ndim - 1 - distance.ndim))
-        factor = np.exp(_LOG_SD * sizes * epsilon.reshape(-1, *[1] * (y.ndim - 1)))
+        # Over the draws first, over the states of a specimen next.
+        sizes = distance.reshape((1, *distance.shape, *[1] * (y.ndim - 1 - distance.ndim)))
+        factor = np.exp(_LOG_SD * sizes * epsilon.reshape((-1, *[1] * (y.ndim - 1))))
         begin = np.nan_to_num(np.asarray(rest[name]))
         values[name] = begin + (y - begin) * factor
     return replace(predicted, values=values)

@@ -20,11 +20,11 @@ from emulator.mechanics.laws import Law, find_law
 from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.draft import prior_lines
 from emulator.scenes.file import read_scene
-from emulator.scenes.forward_problem import ForwardProblem
 from emulator.scenes.parameter_space import Parameter
 from emulator.specimens.specimen import (
     Specimen,
     likely_names,
+    long_table,
     read_states,
     require_specimen,
     specimen,
@@ -49,7 +49,6 @@ _GRIPS = (
     "# marks = 2.0   # mm, side of the square in which stretches were measured; not of the grips",
 )
 _Sizes = dict[str, tuple[SpecimenCurves, np.ndarray]]  # each measurement, and its data (m, c)
-_MANY, _MINUTES = 500, 1.0 / 180.0  # states worth a word, and what each takes on one core
 _HIGH = 40.0  # kPa, 300 mmHg: a pressure without a unit that is higher may be in mmHg
 _NARROW, _WIDE = 0.7, 4.0  # stretches around a tube's inside, over the one without pressure
 _DRIFT = 0.05  # share of the largest number by which it may change while the motion is held
@@ -200,17 +199,6 @@ def _of_tube(stretches: np.ndarray, measured: _Sizes, words: Sequence[str]) -> I
         yield (
             "CHANGE: one axial stretch and no force_axial: pressures alone hardly tell the "
             "stiffness along the tube from that around it"
-        )
-
-
-def long_table(scene: ForwardProblem) -> Iterator[str]:
-    """Say how long an inference takes, where a specimen has many states."""
-    count = len(scene.states.free) if isinstance(scene, Specimen) else 0
-    if count > _MANY:
-        yield (
-            f"{count} states take some {1.0 + _MINUTES * count:.0f} minutes to sample and certify, "
-            f"in proportion: a table of the means of {round(2 * count / _MANY)} neighbouring rows "
-            "tells a smooth curve as well"
         )
 
 

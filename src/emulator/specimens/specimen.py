@@ -59,6 +59,7 @@ _OF_TUBES = (
     (r"id", r"inner_diameter"),
     (r"p", r"pressure"),
 )
+_MANY, _MINUTES = 500, 1.0 / 180.0  # states worth a word, and what each takes on one core
 _MACHINES = {
     r"(extension|displacement|elongation|crosshead).*": "over the length at rest is strain_x [-]",
     r"(load|force)(_.*)?": "is force_x, beside a column area_x [mm2]",
@@ -263,6 +264,18 @@ def read_states(table: Path | Cells, tube: Tube | None = None) -> States:
         # States count their rows from 1; in the file others may be between them.
         text = re.sub(r"\brow (\d+)", lambda m: f"row {rows[int(m[1]) - 1]}", str(error))
         raise InputError(f"data file {path}: {text}") from error
+
+
+def long_table(scene: ForwardProblem) -> list[str]:
+    """Say how long an inference takes, where a specimen has many states."""
+    count = len(scene.states.free) if isinstance(scene, Specimen) else 0
+    if count <= _MANY:
+        return []
+    return [
+        f"{count} states take some {1.0 + _MINUTES * count:.0f} minutes to sample and certify, in "
+        f"proportion: a table of the means of {round(2 * count / _MANY)} neighbouring rows tells a "
+        "smooth curve as well"
+    ]
 
 
 def likely_names(words: Sequence[str], *, of_tube: bool = False) -> str:

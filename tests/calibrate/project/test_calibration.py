@@ -97,7 +97,7 @@ def test_a_scene_keeps_its_simulator_and_never_gets_that_of_an_equal_scene():
 
 def test_fem_data_of_a_check_is_solved_in_the_load_steps_of_the_run(count, monkeypatch, tmp_path):
     def stop(_, __, *, truth, **___):
-        assert truth.forward.simulator.options == NewtonOptions.load_steps(3)
+        assert truth.forward.simulator.options == NewtonOptions.load_steps(3, most=100)
         raise Stopped
 
     monkeypatch.setattr("calibrate.analysis.sbc.sbc", stop)

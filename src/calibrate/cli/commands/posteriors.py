@@ -74,7 +74,7 @@ def infer(arguments: Namespace) -> Answer:
         raise InputError(
             f"--warmup has no effect with sampler '{sampler.name}', which does not adapt"
         )
-    for long_table in offered("calibrate.project.specimen", "long_table") if progress else ():
+    for long_table in offered("emulator.specimens.specimen", "long_table") if progress else ():
         for note in long_table(problem.scene):
             print(note, file=sys.stderr, flush=True)
     posterior = infer(
