@@ -71,9 +71,9 @@ def fold(piece: Piece, share: float) -> Case:
         best = max(piece.laws, key=lambda law: evidence[law] or -np.inf)
         scene = (folder / f"{piece.laws[0]}_scene.toml").read_text().replace("seen.csv", "all.csv")
         (folder / "all.toml").write_text(scene)
-        words = ("--scene", "all.toml", "--observe", f"stress:{','.join(names)}", "--draws", "1000")
+        asked = ("--scene", "all.toml", "--observe", f"stress:{','.join(names)}", "--draws", "1000")
         told = {
-            way: command(folder, "predict", *piece.laws, *words, "--weights", way) for way in WAYS
+            way: command(folder, "predict", *piece.laws, *asked, "--weights", way) for way in WAYS
         }
     measured, held = piece.measured, ~seen[:, None] & np.isfinite(piece.measured)
     scale = float(np.abs(measured[held]).mean())
@@ -145,7 +145,7 @@ def conclude(cases: list[Case]) -> Case:
     """Coverage by band and distance, and scores by set."""
     summary: Case = {"inside": {}, "scores": {}}
     for band in cases[0]["bands"]:
-        parts = {"up to 1.5": [], "up to twice": []}
+        parts: dict[str, list[bool]] = {"up to 1.5": [], "up to twice": []}
         for case in cases:
             for ratio, hit in zip(case["ratio"], case["bands"][band]["inside"], strict=True):
                 parts["up to 1.5" if ratio <= 1.5 + 1e-6 else "up to twice"].append(hit)
