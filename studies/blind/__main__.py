@@ -68,7 +68,8 @@ def fold(piece: Piece, share: float) -> Case:
             told = command(folder, "infer", f"{law}.toml", *words)
             sds = [row["mean"] for n, row in told["parameters"].items() if n.endswith("_sd")]
             noise[law], evidence[law] = float(np.linalg.norm(sds)), told.get("log_evidence")
-        best = max(piece.laws, key=lambda law: evidence[law] or -np.inf)
+        known = [law for law in piece.laws if evidence[law] is not None] or piece.laws
+        best = max(known, key=lambda law: evidence[law] or 0.0)
         scene = (folder / f"{piece.laws[0]}_scene.toml").read_text().replace("seen.csv", "all.csv")
         (folder / "all.toml").write_text(scene)
         asked = ("--scene", "all.toml", "--observe", f"stress:{','.join(names)}", "--draws", "1000")
@@ -204,8 +205,8 @@ def main() -> None:
     results = Results(arguments.out, SEED, again=arguments.again)
     for pieces in SETS[: 1 if arguments.quick else None]:
         for piece in list(pieces(arguments.data))[: 1 if arguments.quick else None]:
-            for words_, share in list(SHARES.items())[: 1 if arguments.quick else None]:
-                name = f"{piece.group}, {piece.name}, {words_}"
+            for part, share in list(SHARES.items())[: 1 if arguments.quick else None]:
+                name = f"{piece.group}, {piece.name}, {part}"
                 results.case(name, partial(fold, piece, share))
     summary = conclude(results.cases)
     results.write(summary=summary)

@@ -40,7 +40,7 @@ def missing_places(observe: Observations) -> dict[str, list[str]]:
             gaps = np.isnan(observe.filled(name, np.zeros(len(entries))))
             gaps = gaps.reshape(len(gaps), -1)
             known = gaps[:, ~gaps.all(axis=0)]
-            # Of a specimen's tests, each has components of its own.
+            # The tests of one specimen measure different components, which are not missing.
             lacking = known.any(axis=1) if part.place else known.all(axis=1)
             places[name] = [*compress(part.row_names, lacking)]
     return {name: rows for name, rows in places.items() if rows}

@@ -62,7 +62,7 @@ class PointObservation(Observation):
 
     @property
     def row_names(self) -> list[str]:
-        """Where each row was measured, in words that follow what was measured."""
+        """The place of each row, in words that follow the name of the number measured there."""
         if self.numbers:
             return [f"in {self.row} {number:g}" for number in getattr(self, self.numbers)]
         return [f"at ({x:.5g}, {y:.5g}, {z:.5g}) mm" for x, y, z in self.points + 0.0]

@@ -44,7 +44,7 @@ class TakenUp:
 
     @property
     def remedy(self) -> str:
-        """What to do about noise that is a misfit, or too small for a measurement's; or nothing."""
+        """The remedy for noise that is a misfit, or too small for a measurement's; else empty."""
         if self.is_misfit:
             return (
                 "the law misses the data by more than they scatter, and posterior sds say nothing "

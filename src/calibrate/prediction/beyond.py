@@ -114,8 +114,10 @@ def how_far_beyond(
     for state, theta in zip(states, jnp.mean(thetas, axis=0), strict=True):
         measures = _measures(forward, scene, theta)
         far = np.zeros(1)
-        for name in measures.keys() & ranges.keys():
-            (values, weights), (low, high) = measures[name], ranges[name]
+        for name, (values, weights) in measures.items():
+            if name not in ranges:
+                continue
+            low, high = ranges[name]
             slack = _SLACK * (high - low)
             outside = (values < low - slack) | (values > high + slack)
             share = float(weights[outside].sum() / weights.sum())

@@ -27,7 +27,7 @@ from calibrate.prediction.predict import Predicted
 from emulator.core.errors import InputError
 
 Way = Literal["stacking", "evidence", "equal"]
-"""What the weights of laws follow from."""
+"""The weights of laws follow from one of these."""
 _DIFFER = 0.2  # by which evidence may give a law more weight than stacking, unsaid
 
 
@@ -88,9 +88,9 @@ def mixture(
 ) -> Predicted:
     """Return the mixture of predictions of one observation by several laws.
 
-    Of each law as many draws are taken as its weight says, without repetition where there are
-    enough. ``draws`` of the result has the number of each draw's law, in the order of
-    ``predictions``; what is of one body only (scene, map, theta) is that of the heaviest law.
+    Each law gives as many draws as its weight says, none of them twice. ``draws`` of the result has
+    the number of each draw's law, in the order of ``predictions``; what is of one body only (scene,
+    map, theta) is that of the heaviest law.
     """
     rng, first = np.random.default_rng([seed, 6]), next(iter(predictions.values()))
     size = min(len(p.thetas) for p in predictions.values())
@@ -108,6 +108,7 @@ def mixture(
     return replace(
         heaviest,
         values=values,
+        thetas=heaviest.thetas[:size],
         draws={"law": np.repeat(np.arange(len(rows)), counts)},
         runs=sum(p.runs for p in predictions.values()),
         failed=sum(p.failed for p in predictions.values()),

@@ -88,7 +88,8 @@ class Transfer:
 def made_of[P: ForwardProblem](scene: P, tissue: ForwardProblem) -> P:
     """Return ``scene`` of another tissue: of its law, with the law's parameters and constants.
 
-    What belongs to loads and supports stays, and so does a bulk modulus that both laws have.
+    Parameters and constants of loads and supports stay, and so does a bulk modulus that both laws
+    have.
     Directions that nothing reads any more are left out.
 
     :class:`InputError` where the law needs fibres or sheets and the scene has none.

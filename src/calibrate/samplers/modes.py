@@ -326,7 +326,7 @@ def curvature(density: Density, data: Data, z: np.ndarray) -> tuple[np.ndarray, 
         return precision, np.nan, np.nan
     values, vectors = np.linalg.eigh(precision)
     smallest = float(values[0])
-    # Of a precision that is singular but for round-off no eigenvalue below that says anything.
+    # An eigenvalue below the round-off of the largest one says nothing of the curvature.
     if not smallest > len(z) * np.finfo(float).eps * values[-1]:
         return precision, min(smallest, 0.0), np.nan
     return precision, smallest, float(np.linalg.norm(slope(z) @ vectors / np.sqrt(values)))

@@ -104,7 +104,7 @@ class NewtonOptions:
             )
 
     @classmethod
-    def load_steps(cls, steps: int, most: int = 300) -> NewtonOptions:
+    def load_steps(cls, steps: int, most: int = max_iterations) -> NewtonOptions:
         """Return options that follow the loading path in ``steps`` increments, or smaller ones.
 
         most : the most iterations, or 20 a step if that is more.

@@ -103,7 +103,7 @@ def mesh_wall(
     smooth : times of Taubin's filter on all surfaces; 10 to 30 take the steps off surfaces of
         voxels.
     least : the least thickness of the walls of both ventricles, mm; the epicardium is moved to it.
-        By default 2 mm, less of hearts below 100 mm from corner to corner.
+        The default is 2 mm, and in proportion less for hearts below 100 mm from corner to corner.
     unit : the unit of the files, ``mm``, ``cm``, ``m`` or ``um``; other lengths are in mm.
 
     Raises

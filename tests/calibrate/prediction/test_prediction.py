@@ -211,6 +211,48 @@ def test_measures_of_a_pulled_block_are_those_of_its_gradient():
     assert {name: float(values[0]) for name, (values, _) in told.items()} == pytest.approx(exact)
 
 
+def test_fibres_decide_where_they_are_strained_more():
+    """Pulled along the fibres to 1.1, then to 1.3: by hand, as both keep their volume."""
+    law, parameter = em.find_law("holzapfel_ogden"), Parameter("a", "kPa", 0.5, 2.0)
+    constants = {"b": 2.0, "a_f": 3.0, "b_f": 2.0, "kappa": 1e4}
+    seen, further = (
+        em.specimen(
+            {"stretch_x": np.array([x])}, law=law, parameters=(parameter,),
+            constants=constants, fibres=[1.0, 0.0, 0.0],
+        )
+        for x in (1.1, 1.3)
+    )  # fmt: skip
+    one, other = (em.homogeneous(piece, incompressible=True) for piece in (seen, further))
+    learned = Learned(seen, {"a": np.ones(4)}, {}, [(one, seen.centre[None])])
+    beyond = how_far_beyond(learned, further, other, ("",), further.centre[None, None])
+    by_fibres = np.log((1.3**2 - 1.0) / (1.1**2 - 1.0))
+    by_all = 0.5 * np.log((1.3**2 + 2.0 / 1.3 - 3.0) / (1.1**2 + 2.0 / 1.1 - 3.0))
+    assert by_fibres > by_all
+    np.testing.assert_allclose(beyond.distances[""], by_fibres, rtol=1e-5)
+    assert [reach.measure for reach in beyond.reaches] == ["I1", "I4f"]
+
+
+def test_distance_of_a_body_is_a_mean_by_what_is_strained():
+    """A block that was stretched by 1.1, whose halves are stretched by 1.2 and 1.5."""
+    mesh = em.generators.box((2.0, 1.0, 1.0), (2, 1, 1))
+    block = em.Scene(
+        name="block", mesh=mesh, law=em.find_law("neo_hookean_split"),
+        parameters=(Parameter("mu", "kPa", 1.0, 9.0),), constants={"kappa": 10.0}, loads=(),
+        supports=(em.Support("left"),),
+    )  # fmt: skip
+    x, along = mesh.nodes[:, 0], np.array([1.0, 0.0, 0.0])
+    known, halves = 0.1 * x, np.where(x < 1.0, 0.2 * x, 0.2 + 0.5 * (x - 1.0))
+    seen = lambda _: known[:, None] * along
+    seen.scene = block
+    learned = Learned(block, {"mu": np.ones(4)}, {}, [(seen, block.centre[None])])
+    beyond = how_far_beyond(
+        learned, block, lambda _: halves[:, None] * along, ("p",), block.centre[None, None]
+    )
+    strained = np.array([1.2, 1.5]) ** 2 - 1.0  # I1 - 3, of halves of one volume
+    far = 0.5 * np.log(strained / (1.1**2 - 1.0))
+    assert float(beyond.distances["p"]) == pytest.approx((far * strained).sum() / strained.sum())
+
+
 TABLE = "stretch_x,stress_x [kPa]\n" + "".join(
     f"{x},{30.0 * (x - x**-2):.4f}\n" for x in (1.0, 1.05, 1.1, 1.15, 1.2)
 )

@@ -37,6 +37,10 @@ def test_a_mixture_has_each_law_as_often_as_its_weight_says():
     assert mixed.scene.name == "c"
     assert (mixed.runs, mixed.failed, mixed.missed) == (54, 3, 0.03)
     assert mixed.warnings == ["a: a warning"]
+    assert len(mixed.thetas) == 100
+    # Some draws of the heaviest law's are left where another law failed at some of its own.
+    fewer = mixture(laws | {"a": predicted_of("a", 1.0, 60)}, {"a": 0.2, "b": 0.0, "c": 0.8})
+    assert len(fewer.thetas) == len(fewer.values["volume"]) == 60
     row = mixed.summary()["volume"]
     assert float(row["mean"]) == pytest.approx(0.2 * 1.0 + 0.8 * 3.0)
 

@@ -94,6 +94,7 @@ def _on_another_scene(arguments: Namespace) -> Answer:
     if arguments.weights is not None and not several:
         raise InputError("--weights are of several posteriors; one has all the weight")
     bodies, verdicts, weights = _learned(runs)
+    shares = {} if weights is None else weights.by(arguments.weights or "stacking")
     scene, known = find_problem(arguments.scene), words.assignments(arguments.theta)
     states = tuple(dict.fromkeys(state for _, state in map(split, known) if state)) or ("",)
     seed = 0 if arguments.seed is None else arguments.seed
@@ -112,7 +113,6 @@ def _on_another_scene(arguments: Namespace) -> Answer:
     chosen, predicted = runs[0], predictions[runs[0]]
     result: dict[str, Any] = {"posterior": verdicts[chosen]}
     if weights is not None:
-        shares = weights.by(arguments.weights or "stacking")
         chosen, predicted = max(shares, key=lambda n: shares[n]), mixture(predictions, shares, seed)
         predicted.warnings.extend(weights.warnings)
         laws = {name: learned.scene.law.name for name, learned in bodies.items()}

@@ -99,7 +99,7 @@ class Solver:
     def __call__(self, task: Task) -> Row:
         """Return the row of ``task``; a solve that fails is a row with that status."""
         began, theta = time.perf_counter(), jnp.asarray(task.theta)
-        if task.number // self.together in self._lost:
+        if task.number // self.together in self._lost:  # theta that is not finite ends at once
             task, theta = task._replace(starts=()), jnp.full_like(theta, jnp.nan)
         solution = self.simulator.solve(theta, self._start(task.starts, theta))
         if task.starts and self.from_rest_again and not solution.converged:
@@ -135,7 +135,7 @@ class Solver:
 
     @cached_property
     def _lost(self) -> set[int]:
-        """Numbers of what has a task that failed."""
+        """The numbers of the draws, or of what else goes together, with a task that failed."""
         return set()
 
     @cached_property
