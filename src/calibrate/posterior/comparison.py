@@ -114,7 +114,10 @@ def compare(trees: Mapping[str, xr.DataTree]) -> Comparison:
     """
     if len(trees) < 2:
         raise InputError(f"compare: {len(trees)} posterior is given; give two or more")
-    _check_same_data(trees)
+    for name, tree in trees.items():
+        if "observed_data" not in tree:
+            raise InputError(f"{name} has no observed data")
+    require_same_data({name: tree["observed_data"].data_vars for name, tree in trees.items()})
     scores = {}
     with warnings.catch_warnings():
         # ArviZ's own warning of influential data; they are counted below.
@@ -150,12 +153,12 @@ def _leave_one_out(data: xr.DataTree) -> Any:
     return stats.loo(data, pointwise=True, log_weights=weights, pareto_k=shapes)
 
 
-def _check_same_data(trees: Mapping[str, xr.DataTree]) -> None:
-    """Refuse posteriors that were not conditioned on the same numbers."""
-    for name, tree in trees.items():
-        if "observed_data" not in tree:
-            raise InputError(f"{name} has no observed data")
-    (one, a), *others = ((name, tree["observed_data"].data_vars) for name, tree in trees.items())
+def require_same_data(data: Mapping[str, Mapping[Any, Any]]) -> None:
+    """Raise :class:`InputError` where models were not given the same numbers.
+
+    data : the data of each model by the observation's name, by the model's name.
+    """
+    (one, a), *others = data.items()
     for two, b in others:
         if set(a) != set(b):
             raise InputError(
@@ -163,7 +166,7 @@ def _check_same_data(trees: Mapping[str, xr.DataTree]) -> None:
                 f"{', '.join(sorted(map(str, b)))}; only models of the same data can be compared"
             )
         for observed, values in a.items():
-            if not np.array_equal(values, b[observed]):
+            if not np.array_equal(values, b[observed], equal_nan=True):
                 raise InputError(
                     f"{one} and {two} were given different data of '{observed}'; only models of "
                     "the same data can be compared"

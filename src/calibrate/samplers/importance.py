@@ -88,11 +88,11 @@ _FITS, _MOST_FITS = 2, 6
 _LIGHT = 0.5  # Pareto shape of the weights of a good fit: their variance is finite
 _CHOSEN = 1024  # points that the kernels of a step are put around
 _FITTED_TO = 4096  # points, resampled, that a proposal is fitted to
-_FRESH = 2048  # points at a time from a fitted proposal
+_FRESH = 4096  # points at a time from a fitted proposal
 _WORTH = 2.0  # independent draws that the points are worth, for one that is resampled from them
 _CENTRES, _WIDTHS, _FREEDOM = 512, (0.5, 1.0), 5.0  # of a fitted proposal
 _NARROW = (0.25, 0.5)  # of a step's: wide kernels in many dimensions undo its contraction
-_WIDE = 0.25  # share of the kernels of a fit around points of the density's fourth root
+_WIDE = 0.5  # share of the kernels of a fit around points of the density's fourth root
 _ON_THE_WAY, _IN_A_FIT = 0.5, 0.25  # share of the kernels that are put beside modes
 _AT_MODE = 1.2  # width of the wider kernels at a mode, over its sd
 _FEWEST_CENTRES = 8  # kernels at a mode
@@ -183,8 +183,8 @@ class _Run:
     def fit(self, z: np.ndarray, log_weights: np.ndarray, log_posterior: np.ndarray) -> None:
         """Go to fresh points from kernels around weighted points z (s, p).
 
-        A quarter of the kernels is around points of the density's fourth root, whose tails are
-        longer: no weight is large there.
+        Half of the kernels are around points of the density's fourth root, whose tails are longer:
+        a thin tail is not lost from one fit to the next.
         """
         modes = of_account(self.modes)
         beside = _IN_A_FIT if len(modes) > 1 else 0.0

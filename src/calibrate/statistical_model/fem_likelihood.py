@@ -6,6 +6,7 @@ It is the only place that solves FEM for a draw.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, NamedTuple, cast
 
@@ -17,13 +18,16 @@ from jax.flatten_util import ravel_pytree
 from calibrate.statistical_model.model import Data, Model
 from emulator.core.errors import InputError
 from emulator.fem import Simulator
-from emulator.fem.campaign import Field, Neighbours, Runs, Solver, solve_rows
+from emulator.fem.campaign import Field, Neighbours, Runs, Solver, Task, at_once, in_order
 from emulator.fem.energy import volume_ratio
 from emulator.fem.solution import EquilibriumSolver
 from emulator.scenes.scene import Scene
 
 _KEPT_BITS = 40  # bits of theta that tell solutions apart, relative to its size
 _KEPT_TO = 2.0**_KEPT_BITS
+_MOST_BYTES = 1e9  # of solutions that are kept unasked
+# Draws that are solved while an earlier one is: far out in a prior one takes as long as ten others.
+_AHEAD = 8
 
 
 class Likelihoods(NamedTuple):
@@ -59,12 +63,14 @@ def _key(theta: np.ndarray) -> bytes:
 class FEMLikelihood:
     """FEM's log likelihood under ``model``.
 
-    Solves start from the cheap map's prediction, or from the nearest solution that was kept.
+    Solves start from the cheap map's prediction, from the nearest solution that was kept, or from
+    the draw's solution in a lower load state.
 
     model : the statistical model.
     simulator : the simulator of the model's scene, or of its specimen.
     kept : the solutions at which nothing is solved again, with their sensitivities, by the bytes of
-        their theta to 40 bits; those of every solve are added. None to keep none.
+        their theta to 40 bits; those of every solve are added. By default the most recent are kept,
+        up to 1 GB.
 
     :class:`InputError` where the simulator is for another scene.
     """
@@ -79,7 +85,8 @@ class FEMLikelihood:
         if simulator.scene.fingerprint != model.forward.scene.fingerprint:
             raise InputError("the simulator's scene is not the posterior's")
         self.model, self.simulator = model, simulator
-        self.kept = kept
+        self.kept, self._keeps_all = {} if kept is None else kept, kept is not None
+        self._solved_before = False
         self._start, self._cheap = jax.jit(model.full), jax.jit(model.map_log_likelihood)
         self._fem, self._derivatives = jax.jit(self._by_fem), jax.jit(self._slopes_of_means)
 
@@ -129,49 +136,40 @@ class FEMLikelihood:
         slopes : whether the solutions have their sensitivities.
         """
         thetas = jnp.concatenate([self.model.states.thetas(draw) for draw in draws])
-        states, kept = len(self.model.states.states), {} if self.kept is None else self.kept
-        keys = [_key(theta) for theta in np.asarray(thetas)]
-        solutions = {
-            draw: {
-                s: kept[key] for s, key in enumerate(keys[draw * states :][:states]) if key in kept
-            }
-            for draw in range(len(draws))
-        }
-        for draw in [draw for draw, fields in solutions.items() if len(fields) == states]:
-            fields = solutions.pop(draw)
-            yield draw, [fields[k] for k in range(states)]
-        # A draw that fails in one load state is done: its other states are not solved.
-        numbers = (
-            k
-            for k in range(len(thetas))
-            if k // states in solutions and k % states not in solutions[k // states]
-        )
-        again = self.kept is not None
-        solver = Solver(
-            self.simulator, sensitivities=slopes, from_rest_again=again, together=states
-        )
+        states, keys = len(self.model.states.states), [_key(row) for row in np.asarray(thetas)]
+        kept = {k: f for k, f in self.kept.items() if f.sensitivities is not None or not slopes}
+        unsolved = dict[int, _Draw]()
+        for number in range(len(draws)):
+            rows = range(number * states, (number + 1) * states)
+            known = {row: kept[keys[row]] for row in rows if keys[row] in kept}
+            if len(known) == states:
+                yield number, [known[row] for row in rows]
+            else:
+                unsolved[number] = _Draw(number, rows, known, {})
         nearest, near = self._kept_beside(thetas)
+
+        def begun(draw: _Draw) -> _Draw:
+            """Return the draw with the starts that are known when its solves begin."""
+            solved = [row for row in draw.rows if row not in draw.known]
+            return draw._replace(starts={k: (self._start(thetas[k]), *nearest(k)) for k in solved})
+
+        solver = _DrawSolver(Solver(self.simulator, sensitivities=slopes), thetas)
         # Not under jit: there the solver cannot use CHOLMOD, which is faster.
-        for row in solve_rows(
-            solver,
-            thetas,
-            numbers=numbers,
-            starts=lambda k: (self._start(thetas[k]), *nearest(k)),
-        ):
-            number, state = divmod(row.number, states)
-            field = Field(row.solution.displacement, row.sensitivities)
-            if self.kept is not None and row.converged:
-                self.kept[keys[row.number]] = near[row.number] = field
-            if number not in solutions:
-                continue
-            if not row.converged:
-                del solutions[number]
-                yield number, None
-                continue
-            solutions[number][state] = field
-            if len(solutions[number]) == states:
-                fields = solutions.pop(number)
-                yield number, [fields[k] for k in range(states)]
+        workers, alone = at_once(self.simulator), int(not self._solved_before)
+        self._solved_before = True
+        tasks = map(begun, unsolved.values())
+        for draw in in_order(solver, tasks, workers, alone=alone, ahead=_AHEAD):
+            for row in sorted(draw.starts.keys() & draw.known.keys()):
+                self._keep(keys[row], draw.known[row])
+                near[row] = draw.known[row]
+            solved = len(draw.known) == states
+            yield draw.number, [draw.known[row] for row in draw.rows] if solved else None
+
+    def _keep(self, key: bytes, field: Field) -> None:
+        self.kept[key] = field
+        size = sum(np.asarray(array).nbytes for array in field if array is not None)
+        while not self._keeps_all and len(self.kept) * size > _MOST_BYTES:
+            del self.kept[next(iter(self.kept))]
 
     def _kept_beside(
         self, thetas: jax.Array
@@ -180,13 +178,13 @@ class FEMLikelihood:
 
         They come from kept solutions, and from those that are added by the numbers of ``thetas``.
         """
-        if self.kept is None:
+        if not isinstance(self.simulator, Simulator):  # a specimen has one start
             return lambda _: [], {}
         count, width = thetas.shape
         known = np.array([np.frombuffer(key) for key in self.kept]).reshape(-1, width)
         fields = {count + k: field for k, field in enumerate(self.kept.values())}
         every = jnp.concatenate([thetas, known])
-        return Neighbours(cast(Scene, self.simulator.scene), every, fields), fields
+        return Neighbours(self.simulator.scene, every, fields), fields
 
     def _stable(self, fields: list[jax.Array], thetas: jax.Array) -> bool | None:
         """Return whether every state's equilibrium is a minimum of the energy, if there is one."""
@@ -226,6 +224,60 @@ class FEMLikelihood:
         value = self.model.log_likelihood(draw, means, data)
         ratios = [volume_ratio(self.simulator.scene, u) for u in fields]
         return value, means, jnp.min(jnp.stack(ratios))
+
+
+class _Draw(NamedTuple):
+    """The load states of one draw.
+
+    number : the number of the draw. rows : the rows of its states in theta.
+    known : the solutions by row.
+    starts : the displacements (n, 3) mm from which the solve of a row may start, by row.
+    """
+
+    number: int
+    rows: range
+    known: dict[int, Field]
+    starts: dict[int, tuple[jax.Array, ...]]
+
+
+@dataclass(frozen=True)
+class _DrawSolver:
+    """Solves the load states of a draw, the smallest load first, until one fails.
+
+    A state also starts from the one before, and from there along its sensitivities. Of 30
+    factorisations, where a soft body is loaded from rest, two or three are left.
+
+    thetas : theta (c, p) by row.
+    """
+
+    solver: Solver
+    thetas: jax.Array
+
+    def __call__(self, draw: _Draw) -> _Draw:
+        """Return the draw with its solutions; fewer than its rows where a solve failed."""
+        scene, known = self.solver.simulator.scene, dict(draw.known)
+        columns = [scene.parameter_names.index(name) for name in scene.load_parameters]
+        loads = np.abs(np.asarray(self.thetas)[:, columns]).sum(axis=1)
+        before: int | None = None
+        for row in sorted(draw.rows, key=lambda row: loads[row]):
+            if row not in known:
+                beside = () if before is None else self._starts(row, before, known[before])
+                task = Task(row, self.thetas[row], (*beside, *draw.starts[row]))
+                result = self.solver(task)
+                if not result.converged:
+                    break
+                known[row] = Field(result.solution.displacement, result.sensitivities)
+            before = row
+        return draw._replace(known=known)
+
+    def _starts(self, row: int, before: int, field: Field) -> tuple[jax.Array, ...]:
+        """Return the starts of a state from the solution of the one before."""
+        if not isinstance(self.solver.simulator, Simulator):  # one start, of a specimen
+            return ()
+        u, step = jnp.asarray(field.displacement), self.thetas[row] - self.thetas[before]
+        if field.sensitivities is None:
+            return (u,)
+        return u, u + jnp.tensordot(step, jnp.asarray(field.sensitivities), axes=1)
 
 
 def runs_of(kept: Mapping[bytes, Field]) -> Runs:

@@ -32,6 +32,8 @@ _FOLLOWING = 2048  # points of the proposal that follows the draws
 _WIDE = 512
 _PRIOR = 512
 _SEARCH_ROUNDS, _POLISH_ROUNDS = 8, 4
+_LARGEST_SD_ERROR = 0.03
+_MOST_TIMES, _MOST_NUMBERS = 8, 60_000_000
 # Shares of the testing points: from the corrected posterior, from the draws' smoothed density, from
 # where FEM may find the data likely, from the surroundings of the draws, and from the whole pool.
 _CORRECTED, _DRAWS, _EXPLORED, _AROUND, _EVEN = 0.55, 0.15, 0.1, 0.1, 0.1
@@ -170,15 +172,42 @@ class Pool(WeightedPoints):
         return self.predictive.evaluate(z, self.correction)
 
     def redrawn(self, rng: np.random.Generator) -> Pool:
-        """Return a pool of fresh points, as many from each proposal.
+        """Return a pool of fresh points, as many from each proposal, or more of each.
 
         Proposals were chosen by looking at points; only points drawn after the choice are
-        independent draws of the mixture (Marin, Pudlo and Sedki 2019).
+        independent draws of the mixture (Marin, Pudlo and Sedki 2019). There are up to eight times
+        as many where the pool alone would leave a posterior sd uncertain by more than 3 %, as far
+        as their data fit into half a gigabyte.
         """
-        prior = self.predictive.prior_draws(key_from(rng), self.priors)
-        fresh = [q.sample(rng, n) for q, n in zip(self.proposals, self.counts, strict=True)]
+        pool = self._fresh(1, rng)
+        most = min(_MOST_TIMES, _MOST_NUMBERS // pool.at.means.size)
+        times = np.ceil((pool.sd_error / _LARGEST_SD_ERROR) ** 2)
+        return pool if min(times, most) <= 1 else self._fresh(int(min(times, most)), rng)
+
+    def _fresh(self, times: int, rng: np.random.Generator) -> Pool:
+        priors, counts = times * self.priors, tuple(times * count for count in self.counts)
+        prior = self.predictive.prior_draws(key_from(rng), priors)
+        fresh = [q.sample(rng, n) for q, n in zip(self.proposals, counts, strict=True)]
         z = np.concatenate([prior, *fresh])
-        return replace(self, z=z, at=self.densities(z), log_kernels=self.log_kernels_at(z))
+        pool = replace(self, priors=priors, counts=counts, z=z, at=self.densities(z))
+        return replace(pool, log_kernels=pool.log_kernels_at(z))
+
+    @property
+    def sd_error(self) -> float:
+        r"""The largest Monte Carlo error of the log sd of an unknown, on its scale.
+
+        By the delta method, with weights :math:`w` and distances :math:`c` to the mean, it is
+        :math:`\tfrac12 \{\sum_i w_i^2 (c_i^2 / \sigma^2 - 1)^2\}^{1/2}` for the sd
+        :math:`\sigma` of the corrected posterior.
+        """
+        x = self.predictive.on_scales(self.predictive.columns(self.z))
+        used = self.corrected > 0.0  # far away a scale may be infinite
+        x, weights = x[used], self.corrected[used]
+        square = (x - weights @ x) ** 2
+        variance = weights @ square
+        varies = variance > 0.0
+        excess = weights[:, None] * (square[:, varies] / variance[varies] - 1.0)
+        return 0.5 * float(np.sqrt((excess**2).sum(axis=0)).max(initial=0.0))
 
     def corrected_by(self, correction: Correction) -> Pool:
         """Return the pool under another correction."""

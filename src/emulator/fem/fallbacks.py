@@ -104,7 +104,7 @@ def strategies(system: System, options: NewtonOptions) -> tuple[Strategy, ...]:
 class SearchState(NamedTuple):
     """The state of the search for equilibrium.
 
-    newton : the state of Newton's method, whose status is also the status of the search.
+    newton : the state of Newton's method; its status and its iterations are also the search's.
     stress : the state of the stress iterates, or None where the scene has none.
     strategy : the index of the strategy.
     begins : whether the next step begins the strategy, or its Newton's method, at ``newton.u``.
@@ -112,7 +112,6 @@ class SearchState(NamedTuple):
     load : the load factor of the stress iterates.
     steps : the steps that the stress iterates have taken in this strategy.
     level_steps : the steps of the stress iterates at this load factor.
-    stress_steps : the steps of the stress iterates in all strategies.
     """
 
     newton: NewtonState
@@ -123,7 +122,6 @@ class SearchState(NamedTuple):
     load: jax.Array
     steps: jax.Array
     level_steps: jax.Array
-    stress_steps: jax.Array
 
     @property
     def running(self) -> jax.Array:
@@ -181,7 +179,6 @@ class EquilibriumSearch:
             load=jnp.ones(()),
             steps=count,
             level_steps=count,
-            stress_steps=count,
         )
 
     def step(self, state: SearchState) -> SearchState:
@@ -230,7 +227,8 @@ class EquilibriumSearch:
         # Strategy 0 ends at an indefinite tangent; later ones solve again without extra stiffness.
         iterates = self._stress_iterates(state.load)
         stress = iterates.step(state.stress, *factors, state.strategy != 0)
-        return _after_stress_step(state, stress, table=self.strategies)
+        most = self.options.max_iterations
+        return _after_stress_step(state, stress, table=self.strategies, most=most)
 
     def _newton_step(self, state: SearchState) -> SearchState:
         """Return the state after one iteration of Newton's method."""
@@ -244,9 +242,9 @@ def _strategy(table: tuple[Strategy, ...], number: jax.Array) -> Any:
     return Strategy._make(jnp.array(column)[number] for column in zip(*table, strict=True))
 
 
-@partial(jax.jit, static_argnames="table")
+@partial(jax.jit, static_argnames=("table", "most"))
 def _after_stress_step(
-    state: SearchState, stress: StressState, *, table: tuple[Strategy, ...]
+    state: SearchState, stress: StressState, *, table: tuple[Strategy, ...], most: int
 ) -> SearchState:
     """Return the state after a step of the stress iterates: next load, Newton, or fallback."""
     newton, strategy = state.newton, _strategy(table, state.strategy)
@@ -259,16 +257,22 @@ def _after_stress_step(
     easy = (stress.error < _EASY) & (state.steps > 1) & strategy.steep
     higher = state.load + jnp.where(easy, 2.0, 1.0) * strategy.load_increment
     load = jnp.where(stress.error < _BALANCED, jnp.minimum(1.0, higher), state.load)
+    iterations = newton.iterations + 1
+    too_many = iterations >= most
     return state._replace(
-        newton=newton._replace(u=jnp.where(ends, jnp.where(failed, 0.0, stress.u), newton.u)),
+        newton=newton._replace(
+            u=jnp.where(ends, jnp.where(failed, 0.0, stress.u), newton.u),
+            iterations=iterations,
+            factorisations=newton.factorisations + 1,
+            status=jnp.where(too_many, Status.ITERATION_LIMIT, newton.status),
+        ),
         stress=stress,
         strategy=jnp.where(ends & failed, state.strategy + 1, state.strategy),
-        begins=ends,
+        begins=ends & ~too_many,
         by_stress=jnp.where(ends, failed, state.by_stress),
         load=load,
         steps=state.steps + 1,
         level_steps=jnp.where(load > state.load, 0, state.level_steps + 1),
-        stress_steps=state.stress_steps + 1,
     )
 
 
@@ -302,9 +306,4 @@ def find_equilibrium(
     """
     search = EquilibriumSearch(system, options, theta)
     first = search.begin(search.load_stepping.begin(start))
-    state = while_loop(lambda state: state.running, search.step, first)
-    solution = state.newton.solution()
-    return solution._replace(
-        iterations=solution.iterations + state.stress_steps,
-        factorisations=solution.factorisations + state.stress_steps,
-    )
+    return while_loop(lambda state: state.running, search.step, first).newton.solution()

@@ -10,8 +10,10 @@ Ogden (2009), Table 1, to dogs and pigs are then within 2.2 log-sds (a 0.057 to 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
+from emulator.core.errors import look_up
+from emulator.mechanics.laws import LAWS
 from emulator.scenes.parameter_space import LogNormal
 
 _HUMAN = (
@@ -74,6 +76,32 @@ OF_LAWS: Mapping[str, Mapping[str, LogNormal]] = {
     "guccione": _GUCCIONE,
 }
 """The priors of each law's parameters, by the law's name."""
+
+LAWS_OF_TISSUES: Mapping[str, tuple[str, ...]] = {
+    "artery": ("holzapfel_gasser_ogden", "gasser_ogden_holzapfel", "fung_orthotropic"),
+    "brain": ("ogden_1", "mooney_rivlin", "neo_hookean"),
+    "myocardium": ("holzapfel_ogden_orthotropic", "holzapfel_ogden", "guccione"),
+    "rubber": ("mooney_rivlin", "yeoh", "ogden_2"),
+    "skin": ("gasser_ogden_holzapfel", "holzapfel_gasser_ogden", "fung_planar"),
+}
+"""The laws that the literature takes for a tissue.
+
+Holzapfel, Gasser & Ogden (2000), Gasser, Ogden & Holzapfel (2006), Chuong & Fung (1983); Budday et
+al. (2017); Holzapfel & Ogden (2009), Guccione, McCulloch & Waldman (1991); Mooney (1940), Yeoh
+(1993), Ogden (1972); Tong & Fung (1976).
+"""
+
+
+def laws_named(words: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of laws, each once, where ``words`` are names of laws or of tissues.
+
+    :class:`InputError` for a name that is neither.
+    """
+    for word in words:
+        look_up({**LAWS, **LAWS_OF_TISSUES}, word, "law or tissue")
+    names = (name for word in words for name in LAWS_OF_TISSUES.get(word, (word,)))
+    return tuple(dict.fromkeys(names))
+
 
 PRESSURE = LogNormal(1.07, 0.44, _FILLED)
 """The prior of the pressure that fills a left ventricle, kPa."""

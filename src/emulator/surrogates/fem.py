@@ -64,7 +64,7 @@ class FEMForward:
     def _solved(
         self, thetas: jax.Array, *, sensitivities: bool = False
     ) -> tuple[Prediction, list[Row]]:
-        solver = Solver(self.simulator, sensitivities=sensitivities, from_rest_again=False)
+        solver = Solver(self.simulator, sensitivities=sensitivities)
         start = self.start
         starts = (lambda _: ()) if start is None else (lambda number: (start(thetas[number]),))
         solved = solve_rows(solver, thetas, starts=starts)

@@ -4,6 +4,7 @@ import jax
 import numpy as np
 import pytest
 
+from calibrate.certificate.estimates import jackknife, moments
 from calibrate.importance import transport
 from calibrate.importance.proposals import Kernels, tempered
 from calibrate.importance.weights import effective, normalised
@@ -70,6 +71,29 @@ def test_the_pool_is_the_posterior_wherever_the_draws_are(case, predictive):
         mean, sd = mean_and_sd(pool.corrected, predictive.constrain(pool.z)["mu"])
         assert abs(mean - exact[0]) < 0.15 * exact[1]
         assert sd == pytest.approx(exact[1], rel=0.1)
+
+
+def test_more_points_are_drawn_where_the_pool_alone_leaves_an_sd_uncertain(
+    case, predictive, monkeypatch
+):
+    """The error of the delta method is the jackknife's; it falls as points are added."""
+    z, rng = predictive.unconstrain(case[0].draws()), np.random.default_rng(2)
+    pool = Pool.search(predictive, no_correction(1, 2, 9), z, (), rng)
+    few = pool.redrawn(rng)
+    x = predictive.on_scales(predictive.columns(few.z))
+    _, error = jackknife(lambda used: moments(x, few.corrected * used)[2:4], len(x))
+    assert few.sd_error == pytest.approx(error.max(), rel=0.3)
+    assert few.drawn == len(few.z) == pool.drawn
+    monkeypatch.setattr("calibrate.statistical_model.pool._LARGEST_SD_ERROR", few.sd_error / 1.9)
+    more = pool.redrawn(rng)
+    assert more.drawn == len(more.z) == 4 * pool.drawn
+    assert more.sd_error == pytest.approx(0.5 * few.sd_error, rel=0.2)
+    few_mean, few_sd = mean_and_sd(few.corrected, few.z[:, 0])
+    more_mean, more_sd = mean_and_sd(more.corrected, more.z[:, 0])
+    assert abs(more_mean - few_mean) < 0.2 * few_sd
+    assert more_sd == pytest.approx(few_sd, rel=0.15)
+    monkeypatch.setattr("calibrate.statistical_model.pool._MOST_NUMBERS", 2 * 9 * pool.drawn)
+    assert pool.redrawn(rng).drawn == 2 * pool.drawn
 
 
 def test_tempering_leaves_as_many_as_asked():

@@ -24,6 +24,13 @@ if TYPE_CHECKING:
 
 @command(
     run_options("sampler", "sampler_options", "warmup", "draws", "chains", "seed"),
+    option(
+        "others",
+        "SCENE",
+        "the same body or test by other laws: each goes into a folder of its name in DIR, and they "
+        "are compared",
+        nargs="*",
+    ),
     flag("--no-certify", "leave the check against FEM for later"),
     option(
         "--budget",
@@ -35,10 +42,52 @@ if TYPE_CHECKING:
     flag("--force", "replace the results of an earlier run in DIR"),
     help="sample a posterior",
     epilog="examples: calibrate infer SCENE --data measured.csv --noise 0.2 --out DIR; "
-    "calibrate infer experiment.toml --out DIR",
+    "calibrate infer experiment.toml --out DIR; calibrate infer test_ogden.toml test_yeoh.toml "
+    "--out DIR",
 )
 def infer(arguments: Namespace) -> Answer:
-    """Sample and certify a posterior, or those of members of a population, and save them."""
+    """Sample and certify a posterior, or one by each of several laws, and save them."""
+    from calibrate.cli.run_words import problem_of
+    from calibrate.posterior import read_tree
+    from calibrate.posterior.comparison import compare, require_same_data
+    from calibrate.project.results import POSTERIOR
+
+    budget = math.inf if arguments.budget is None else seconds(arguments.budget)
+    scenes = [arguments.scene, *arguments.others]
+    if len(scenes) == 1:
+        return _infer_one(arguments, budget)
+    runs = {
+        Path(scene).stem: Namespace(
+            **{**vars(arguments), "scene": scene, "out": f"{arguments.out}/{Path(scene).stem}"}
+        )
+        for scene in scenes
+    }
+    if len(runs) < len(scenes):
+        raise InputError("infer: two scenes have one name; each gets a folder of its name")
+    check_folder(arguments.out)
+    data = {name: problem_of(run).data for name, run in runs.items()}
+    measured = {name: values for name, values in data.items() if values is not None}
+    if len(measured) < len(data):
+        raise InputError("infer: several laws need data that were measured: --data FILE")
+    require_same_data(measured)
+    answers = {name: _infer_one(run, budget / len(runs)) for name, run in runs.items()}
+    trees = {run.out: read_tree(Path(run.out) / POSTERIOR) for run in runs.values()}
+    comparison = compare(trees)
+    result = {
+        "runs": {name: answer.result for name, answer in answers.items()},
+        "comparison": {**asdict(comparison), "verdict": comparison.verdict},
+    }
+    texts = [f"{name}\n{answer.text}\n" for name, answer in answers.items()]
+    then = f"calibrate predict {' '.join(trees)} --scene OTHER mixes them"
+    text = "\n".join([*texts, comparison_summary(comparison), then])
+    return Answer(result, text, all(answer.usable for answer in answers.values()))
+
+
+def _infer_one(arguments: Namespace, budget: float) -> Answer:
+    """Sample and certify a posterior, or those of members of a population, and save them.
+
+    budget : the time for it, s.
+    """
     from calibrate.cli.run_words import plan_of
     from calibrate.project import (
         Problem,
@@ -52,9 +101,7 @@ def infer(arguments: Namespace) -> Answer:
 
     folder, progress = check_folder(arguments.out), not arguments.json
     plan, force, certify = plan_of(arguments), arguments.force, not arguments.no_certify
-    begin, budget = time.perf_counter(), math.inf
-    if arguments.budget is not None:
-        budget = seconds(arguments.budget)
+    begin = time.perf_counter()
     written = f"written to {arguments.out}; its page: calibrate report {arguments.out}"
     if not isinstance(plan, Run | Problem):
         from calibrate.project.members import infer_members, members_report  # a room

@@ -30,7 +30,14 @@ _FAR = 0.15  # of the body's length
     option("mesh", "FILE", "mesh of tetrahedra, or the table of a specimen's test"),
     option("--out", "FILE.toml", "file to write (default: beside the first)"),
     option("--unit", "mm|cm|m|um", "of the mesh's coordinates (default: guessed, and said)"),
-    option("--law", "NAME", "default: by whether there are fibres"),
+    option(
+        "--law",
+        "NAME",
+        "laws, or tissues for the laws that are used for them (artery, brain, myocardium, rubber, "
+        "skin); of several, files each (default: by whether there are fibres)",
+        nargs="+",
+        default=[],
+    ),
     option(
         "--tube",
         "RADIUS,LAYER[,...]",
@@ -44,17 +51,44 @@ _FAR = 0.15  # of the body's length
     epilog="example: calibrate init ventricle.msh, then calibrate simulate ventricle.toml",
 )
 def init(arguments: Namespace) -> Answer:
-    """Write the scene file, and describe the mesh."""
+    """Write the files of one law, or of each of several."""
     from emulator.core.cells import OTHER_SPREADSHEETS, SPREADSHEETS, TEXT
+    from emulator.scenes.tissue_priors import laws_named
+
+    source, laws = Path(arguments.mesh), laws_named(arguments.law)
+    out = Path(arguments.out or source.parent / f"{source.stem or 'scene'}.toml")
+    is_table = source.suffix.lower() in (*TEXT, *SPREADSHEETS, *OTHER_SPREADSHEETS)
+    draft = _init_specimen if is_table else _init_scene
+    if len(laws) < 2:
+        return draft(source, out, laws[0] if laws else None, arguments)
+    answers, reasons = dict[str, Answer](), dict[str, str]()
+    for law in laws:
+        try:
+            file = out.with_name(f"{out.stem}_{law}{out.suffix}")
+            answers[law] = draft(source, file, law, arguments)
+        except InputError as reason:
+            reasons[law] = str(reason)
+    if not answers:
+        raise InputError(reasons[laws[0]])
+    result = {"laws": {law: answer.result for law, answer in answers.items()}, "left_out": reasons}
+    files = [answer.result["out"] for answer in answers.values()]
+    first = next(iter(answers.values())).text.splitlines()[:-1]  # what is alike is said once
+    lines = [
+        *(line for line in first if not line.startswith("law ")),
+        *(f"law {law}: {answer.result['out']}" for law, answer in answers.items()),
+        *(f"law {law} is left out: {reason}" for law, reason in reasons.items()),
+        f"look for CHANGE in the scenes, then: calibrate infer {' '.join(files)} --out RUNS",
+    ]
+    return Answer(result, "\n".join(lines))
+
+
+def _init_scene(mesh_path: Path, out: Path, law: str | None, arguments: Namespace) -> Answer:
+    """Write the scene file, and describe the mesh."""
     from emulator.scenes.draft import draft_scene
 
-    mesh_path = Path(arguments.mesh)
-    out = arguments.out or mesh_path.parent / f"{mesh_path.stem or 'scene'}.toml"
-    if mesh_path.suffix.lower() in (*TEXT, *SPREADSHEETS, *OTHER_SPREADSHEETS):
-        return _init_specimen(mesh_path, out, arguments)
     if arguments.tube is not None:
         raise InputError("--tube is for a table of stretches and pressures, not for a mesh")
-    draft = draft_scene(arguments.mesh, out, unit=arguments.unit, law=arguments.law)
+    draft = draft_scene(mesh_path, out, unit=arguments.unit, law=law)
     scene, mesh = draft.scene, draft.scene.mesh
     notes = [*draft.notes, *_weight_notes(scene)]
     facets = {name: len(rows) for name, rows in mesh.facet_sets.items()}
@@ -99,7 +133,7 @@ def _weight_notes(scene: Scene) -> Iterator[str]:
         yield f"CHANGE: its own weight moves it by {fall:.3g} of {size:.3g} mm: {remedy}"
 
 
-def _init_specimen(table_path: Path, out: str | Path, arguments: Namespace) -> Answer:
+def _init_specimen(table_path: Path, out: Path, law: str | None, arguments: Namespace) -> Answer:
     """Write the files for a table, and list the guesses."""
     from calibrate.project.specimen import draft_specimen
 
@@ -108,7 +142,7 @@ def _init_specimen(table_path: Path, out: str | Path, arguments: Namespace) -> A
             "--unit has no effect on a table: its columns have units, 'stress_x [MPa]'"
         )
     tube = None if arguments.tube is None else _tube(arguments.tube)
-    draft = draft_specimen(table_path, out, law=arguments.law, tube=tube)
+    draft = draft_specimen(table_path, out, law=law, tube=tube)
     result = {
         "out": str(draft.path),
         "scene": str(draft.scene_path),

@@ -144,8 +144,7 @@ def run_campaign(
     """Solve at every theta (c, p).
 
     Each run starts from the solution at the nearest theta so far, from that solution extrapolated
-    along its sensitivities, or from ``predictor``: whichever has the smallest residual. If that
-    start fails, the run starts again from rest.
+    along its sensitivities, or from ``predictor``: whichever has the smallest residual.
 
     Parameters
     ----------

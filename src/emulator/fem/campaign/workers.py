@@ -81,16 +81,11 @@ class Solver:
     sensitivities : compute du/dtheta too, from each solve's own factor: a tenth of its time on a
         ventricle with five parameters.
     energy : compute the potential energy; :class:`InputError` for a scene without one.
-    from_rest_again : solve a second time, from rest, where a start fails.
-    together : the number of tasks, one after the other, of which none is of use if one fails, as of
-        the load states of one draw: those that are not begun then fail unsolved.
     """
 
     simulator: EquilibriumSolver
     sensitivities: bool = False
     energy: bool = False
-    from_rest_again: bool = True
-    together: int = 1
 
     def __post_init__(self) -> None:
         if self.energy:
@@ -99,13 +94,7 @@ class Solver:
     def __call__(self, task: Task) -> Row:
         """Return the row of ``task``; a solve that fails is a row with that status."""
         began, theta = time.perf_counter(), jnp.asarray(task.theta)
-        if task.number // self.together in self._lost:  # theta that is not finite ends at once
-            task, theta = task._replace(starts=()), jnp.full_like(theta, jnp.nan)
         solution = self.simulator.solve(theta, self._start(task.starts, theta))
-        if task.starts and self.from_rest_again and not solution.converged:
-            solution = self.simulator.solve(theta)
-        if self.together > 1 and not solution.converged:
-            self._lost.add(task.number // self.together)
         energy = jnp.asarray(jnp.nan)
         if self.energy and solution.converged:
             energy = self._energy(solution.displacement, theta)
@@ -132,11 +121,6 @@ class Solver:
             assert isinstance(self.simulator, Simulator)
             return _best(self.simulator.system, stacked, theta)
         return jnp.asarray(starts[0]) if starts else None
-
-    @cached_property
-    def _lost(self) -> set[int]:
-        """The numbers of the draws, or of what else goes together, with a task that failed."""
-        return set()
 
     @cached_property
     def _energy(self):  # noqa: ANN202 - a compiled program, private
@@ -172,14 +156,20 @@ def at_once(simulator: EquilibriumSolver, nodes: int | None = None) -> int:
 
 
 def in_order[T, R](
-    function: Callable[[T], R], tasks: Iterator[T], workers: int, *, alone: int = 1
+    function: Callable[[T], R],
+    tasks: Iterator[T],
+    workers: int,
+    *,
+    alone: int = 1,
+    ahead: int | None = None,
 ) -> Iterator[R]:
     """Yield ``function`` of every task, in the order of the tasks, by ``workers`` threads.
 
     The first ``alone`` tasks come before the threads, which use what they compile. Then a task is
-    taken when all but ``workers`` of the results before it have been yielded. So what a task is
-    made of, such as a start from earlier rows, does not depend on which thread was quicker. While
-    the threads work, as many factors are kept as there are threads.
+    taken when all but ``ahead`` of the results before it have been yielded, by default all but
+    ``workers``. So what a task is made of, such as a start from earlier rows, does not depend on
+    which thread was quicker; with more ahead, fewer tasks wait for a slow one. While the threads
+    work, as many factors are kept as there are threads.
     """
     for task in islice(tasks, alone):
         yield function(task)
@@ -193,7 +183,7 @@ def in_order[T, R](
         try:
             for task in tasks:
                 pending.append(pool.submit(on_thread, task))
-                if len(pending) > workers:
+                if len(pending) > (workers if ahead is None else ahead):
                     yield pending.popleft().result()
             while pending:
                 yield pending.popleft().result()

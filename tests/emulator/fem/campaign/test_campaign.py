@@ -8,8 +8,6 @@ import pytest
 import emulator as em
 from emulator.core.errors import SolverError
 from emulator.fem import run_campaign, sobol
-from emulator.fem.campaign import workers
-from emulator.fem.solution import Status
 from emulator.scenes.loads import Gravity
 from emulator.surrogates.taylor import constant, expand
 from scene_support import block
@@ -87,35 +85,6 @@ def test_an_expansion_that_crushes_elements_is_not_chosen(simulator, thetas, sol
     start, solution = solves[-1]
     np.testing.assert_array_equal(start, runs.displacement[0])
     assert solution.converged
-
-
-def test_where_a_start_fails_rest_is_tried(simulator, thetas, monkeypatch):
-    solve, starts = em.Simulator.solve, []
-
-    def shy(self, theta, start=None):
-        starts.append(start)
-        solution = solve(self, theta)
-        status = solution.status if start is None else jnp.asarray(Status.LOAD_LIMIT)
-        return solution._replace(status=status)
-
-    monkeypatch.setattr(em.Simulator, "solve", shy)
-    runs = run_campaign(simulator, thetas[:3])
-    assert starts[0] is None  # the others, on threads of their own, in any order
-    assert sorted(start is None for start in starts[1:]) == [False, False, True, True]
-    assert jnp.isfinite(runs.displacement).all()
-
-
-def test_states_of_a_draw_that_has_failed_are_not_solved(simulator, thetas):
-    """The second state of the first draw fails unsolved, those of the next are solved."""
-    solver = workers.Solver(simulator, together=2)
-    tasks = [np.full_like(thetas[0], np.nan), thetas[0], thetas[0], thetas[1]]
-    rows = [solver(workers.Task(k, theta)) for k, theta in enumerate(tasks)]
-    assert [row.converged for row in rows] == [False, False, True, True]
-    assert [int(row.solution.iterations) for row in rows][:2] == [0, 0]
-    alone = workers.Solver(simulator)
-    assert [alone(workers.Task(k, theta)).converged for k, theta in enumerate(tasks[:2])] == [
-        False, True,
-    ]  # fmt: skip
 
 
 def test_a_failure_names_the_run(simulator, thetas):
