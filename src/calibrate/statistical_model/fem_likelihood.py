@@ -150,8 +150,13 @@ class FEMLikelihood:
 
         def begun(draw: _Draw) -> _Draw:
             """Return the draw with the starts that are known when its solves begin."""
-            solved = [row for row in draw.rows if row not in draw.known]
-            return draw._replace(starts={k: (self._start(thetas[k]), *nearest(k)) for k in solved})
+            starts = dict[int, tuple[jax.Array, ...]]()
+            for row in (row for row in draw.rows if row not in draw.known):
+                by_map, beside = self._start(thetas[row]), nearest(row)
+                # Of an imaged body the last start is taken, and while all solutions are kept the
+                # map has still to learn.
+                starts[row] = (by_map, *beside) if self._keeps_all else (*beside, by_map)
+            return draw._replace(starts=starts)
 
         solver = _DrawSolver(Solver(self.simulator, sensitivities=slopes), thetas)
         # Not under jit: there the solver cannot use CHOLMOD, which is faster.

@@ -81,14 +81,15 @@ LAWS_OF_TISSUES: Mapping[str, tuple[str, ...]] = {
     "artery": ("holzapfel_gasser_ogden", "gasser_ogden_holzapfel", "fung_orthotropic"),
     "brain": ("ogden_1", "mooney_rivlin", "neo_hookean"),
     "myocardium": ("holzapfel_ogden_orthotropic", "holzapfel_ogden", "guccione"),
-    "rubber": ("mooney_rivlin", "yeoh", "ogden_2"),
+    "rubber": ("mooney_rivlin", "yeoh", "ogden_1"),
     "skin": ("gasser_ogden_holzapfel", "holzapfel_gasser_ogden", "fung_planar"),
 }
 """The laws that the literature takes for a tissue.
 
 Holzapfel, Gasser & Ogden (2000), Gasser, Ogden & Holzapfel (2006), Chuong & Fung (1983); Budday et
 al. (2017); Holzapfel & Ogden (2009), Guccione, McCulloch & Waldman (1991); Mooney (1940), Yeoh
-(1993), Ogden (1972); Tong & Fung (1976).
+(1993), Ogden (1972); Tong & Fung (1976). Ogden's law has one term: of two, one test does not tell
+which is which.
 """
 
 

@@ -28,7 +28,7 @@ def test_every_tissue_has_laws_that_exist():
     for tissue, laws in LAWS_OF_TISSUES.items():
         assert set(laws) <= LAWS.keys(), tissue
         assert laws_named([tissue]) == laws
-    assert laws_named(["yeoh", "rubber"]) == ("yeoh", "mooney_rivlin", "ogden_2")
+    assert laws_named(["yeoh", "rubber"]) == ("yeoh", "mooney_rivlin", "ogden_1")
     with pytest.raises(InputError, match="law or tissue 'rubbr' is unknown; .*'rubber'"):
         laws_named(["rubbr"])
 
@@ -55,7 +55,7 @@ def test_a_law_that_does_not_suit_is_left_out_and_named(table, capsys):
     assert main(["init", "pull.csv", "--law", "rubber"]) == 0
     text = capsys.readouterr().out
     assert "law yeoh is left out: pull_yeoh.toml is there already" in text
-    assert "calibrate infer pull_mooney_rivlin.toml pull_ogden_2.toml --out RUNS" in text
+    assert "calibrate infer pull_mooney_rivlin.toml pull_ogden_1.toml --out RUNS" in text
     assert main(["init", "pull.csv", "--law", "yeoh", "mooney_rivlin"]) == 2
     assert "is there already" in capsys.readouterr().err
 

@@ -20,6 +20,7 @@ from emulator.core.store import check_folder
 
 if TYPE_CHECKING:
     from calibrate.posterior.comparison import Comparison
+    from calibrate.project.members import Members
 
 
 @command(
@@ -104,17 +105,7 @@ def _infer_one(arguments: Namespace, budget: float) -> Answer:
     begin = time.perf_counter()
     written = f"written to {arguments.out}; its page: calibrate report {arguments.out}"
     if not isinstance(plan, Run | Problem):
-        from calibrate.project.members import infer_members, members_report  # a room
-
-        if arguments.budget is not None:
-            raise InputError("--budget is of one run; members of a population take their time")
-
-        hierarchy, verdicts = infer_members(
-            plan, folder, certify=certify, force=force, progress=progress
-        )
-        result = members_report(hierarchy, verdicts)
-        usable = {*verdicts.values()} <= {"accepted"}
-        return Answer(result, f"{members_summary(result)}\n{written}", usable)
+        return _infer_members(plan, arguments, written)
     problem = by_rounds(read_problem(plan))
     run, (sampler, options) = problem.run, problem.run.sampling()
     if arguments.warmup is not None and not hasattr(options, "warmup"):
@@ -144,6 +135,24 @@ def _infer_one(arguments: Namespace, budget: float) -> Answer:
     result = report(run, posterior, certificate)
     usable = certificate is None or certificate.verdict == "accepted"
     return Answer(result, f"{posterior_summary(result)}\n{written}", usable)
+
+
+def _infer_members(plan: Members, arguments: Namespace, written: str) -> Answer:
+    """Sample the members of a population, each by itself and all together; ``written`` ends it."""
+    from calibrate.project.members import infer_members, members_report  # a room
+
+    if arguments.budget is not None:
+        raise InputError("--budget is of one run; members of a population take their time")
+    hierarchy, verdicts = infer_members(
+        plan,
+        Path(arguments.out),
+        certify=not arguments.no_certify,
+        force=arguments.force,
+        progress=not arguments.json,
+    )
+    result = members_report(hierarchy, verdicts)
+    usable = {*verdicts.values()} <= {"accepted"}
+    return Answer(result, f"{members_summary(result)}\n{written}", usable)
 
 
 def _add_solves(parser: ArgumentParser) -> None:

@@ -117,9 +117,10 @@ class Solver:
         if self.simulator.scene.loaded_by:
             starts = starts[-1:]
         if len(starts) > 1:
-            stacked = jnp.stack([jnp.asarray(start) for start in starts])
             assert isinstance(self.simulator, Simulator)
-            return _best(self.simulator.system, stacked, theta)
+            system = self.simulator.system
+            errors = [float(_imbalance(system, jnp.asarray(u), theta)) for u in starts]
+            starts = [starts[int(np.argmin(errors))]]
         return jnp.asarray(starts[0]) if starts else None
 
     @cached_property
@@ -128,15 +129,11 @@ class Solver:
 
 
 @compiled
-def _best(system: System, starts: jax.Array, theta: jax.Array) -> jax.Array:
-    """Return the start with the smallest residual among several (s, n, 3)."""
-
-    def residual(u: jax.Array) -> jax.Array:
-        error = system.relative_residual(u, theta)
-        valid = jnp.isfinite(error) & (system.least_volume_ratio(u) > 0.0)
-        return jnp.where(valid, error, jnp.inf)
-
-    return starts[jnp.argmin(jax.lax.map(residual, starts))]
+def _imbalance(system: System, u: jax.Array, theta: jax.Array) -> jax.Array:
+    """Return the relative residual () of a start (n, 3) mm, infinite where it is not valid."""
+    error = system.relative_residual(u, theta)
+    valid = jnp.isfinite(error) & (system.least_volume_ratio(u) > 0.0)
+    return jnp.where(valid, error, jnp.inf)
 
 
 # ---- many solves ---------------------------------------------------------------------------------
