@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,7 +20,8 @@ from emulator.mechanics.laws import Law, find_law
 from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.draft import prior_lines
 from emulator.scenes.file import read_scene
-from emulator.scenes.parameter_space import Parameter
+from emulator.scenes.parameter_space import LogNormal, Parameter
+from emulator.scenes.tissue_priors import MYOCARDIUM, OF_LAWS
 from emulator.specimens.specimen import (
     Specimen,
     likely_names,
@@ -69,7 +70,12 @@ class SpecimenDraft(NamedTuple):
 
 
 def draft_specimen(
-    table: str | Path, out: str | Path, *, law: str | None = None, tube: Tube | None = None
+    table: str | Path,
+    out: str | Path,
+    *,
+    law: str | None = None,
+    tissue: str | None = None,
+    tube: Tube | None = None,
 ) -> SpecimenDraft:
     """Write a scene file and an experiment file for a table of a specimen's test.
 
@@ -81,6 +87,8 @@ def draft_specimen(
     out : the experiment file, ``NAME.toml``; the scene is ``NAME_scene.toml`` beside it.
     law : name of the law; by default two families of fibres for tests that pull along two axes,
         an isotropic exponential else.
+    tissue : the tissue, from whose published exponents of the law those of the specimen get their
+        priors; moduli follow from the table.
     tube : the sector of a tube.
 
     Raises
@@ -111,7 +119,10 @@ def draft_specimen(
     name = source.relative_to(folder) if source.is_relative_to(folder) else source
     scene_path.parent.mkdir(parents=True, exist_ok=True)
     pulled = bool(states.pulls.any())
-    text = _scene_text(material, name.as_posix(), axes, slope, tube, pulled=pulled)
+    published = OF_LAWS.get(material.name, {}) if tissue == MYOCARDIUM else {}
+    without_unit = {quantity.name for quantity in material.quantities if not quantity.unit}
+    exponents = {name: published[name] for name in published.keys() & without_unit}
+    text = _scene_text(material, name.as_posix(), axes, slope, exponents, tube, pulled=pulled)
     if tube is None and not pulled:
         text += "\n".join(["", *_GRIPS, ""])
     scene_path.write_text(text, encoding="utf-8")
@@ -275,10 +286,18 @@ def _stiffnesses(tube: Tube | None) -> list[str]:
 
 
 def _scene_text(
-    law: Law, table: str, axes: list[str], slope: float, tube: Tube | None, *, pulled: bool
+    law: Law,
+    table: str,
+    axes: list[str],
+    slope: float,
+    published: Mapping[str, LogNormal],
+    tube: Tube | None,
+    *,
+    pulled: bool,
 ) -> str:
     """Return the scene file. Fibres are along the first axis that moves, sheets across it.
 
+    published : the priors of parameters that do not follow from the table.
     pulled : whether the machine prescribes forces, which grips cannot have.
     """
     lines = [f'law = "{law.name}"   # see docs/laws.md for others', f'specimen = "{table}"']
@@ -294,7 +313,7 @@ def _scene_text(
             lines.append(f"sheets = {unit[second]}   # CHANGE: the second axis of the tissue")
     for quantity in law.quantities:
         if quantity.name != "kappa":
-            lines += ["", *_parameter(quantity, slope)]
+            lines += ["", *_parameter(quantity, slope, published.get(quantity.name))]
     layers = _stiffnesses(tube)
     for name in layers[1:]:
         lines += [
@@ -316,9 +335,11 @@ def _scene_text(
     return "\n".join(lines) + "\n"
 
 
-def _parameter(quantity: Quantity, slope: float) -> list[str]:
+def _parameter(quantity: Quantity, slope: float, published: LogNormal | None) -> list[str]:
     low, high = (share * slope for share in _MODULI) if quantity.unit == "kPa" else _EXPONENTS
     head = [f"[parameters.{quantity.name}]", f'unit = "{quantity.unit}"']
+    if published is not None:
+        return [*head, *prior_lines(published.median, published.log_sd, published.source)]
     if quantity.low_admitted:
         low = quantity.low
     elif quantity.low == 0.0 and not np.isfinite(quantity.high):

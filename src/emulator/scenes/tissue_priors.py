@@ -77,10 +77,12 @@ OF_LAWS: Mapping[str, Mapping[str, LogNormal]] = {
 }
 """The priors of each law's parameters, by the law's name."""
 
+MYOCARDIUM = "myocardium"
+"""The tissue whose laws' published parameters :data:`OF_LAWS` has."""
 LAWS_OF_TISSUES: Mapping[str, tuple[str, ...]] = {
     "artery": ("holzapfel_gasser_ogden", "gasser_ogden_holzapfel", "fung_orthotropic"),
     "brain": ("ogden_1", "mooney_rivlin", "neo_hookean"),
-    "myocardium": ("holzapfel_ogden_orthotropic", "holzapfel_ogden", "guccione"),
+    MYOCARDIUM: ("holzapfel_ogden_orthotropic", "holzapfel_ogden", "guccione"),
     "rubber": ("mooney_rivlin", "yeoh", "ogden_1"),
     "skin": ("gasser_ogden_holzapfel", "holzapfel_gasser_ogden", "fung_planar"),
 }

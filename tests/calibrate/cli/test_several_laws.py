@@ -8,7 +8,8 @@ import pytest
 from calibrate.cli import main
 from emulator.core.errors import InputError
 from emulator.mechanics.laws import LAWS
-from emulator.scenes.tissue_priors import LAWS_OF_TISSUES, laws_named
+from emulator.scenes.file import read_scene
+from emulator.scenes.tissue_priors import LAWS_OF_TISSUES, OF_LAWS, laws_named
 
 STRETCHES = 1.0 + 0.05 * np.arange(1, 9)
 
@@ -48,6 +49,21 @@ def test_files_of_each_law_and_a_posterior_of_each(table, capsys):
     assert sum(model["weight"] for model in models.values()) == pytest.approx(1.0)
     assert main(["compare", *models]) == 0
     assert result["comparison"]["verdict"] in capsys.readouterr().out
+
+
+def test_a_tissue_brings_the_exponents_of_published_hearts(table):
+    """Its moduli still follow from the table; a law that is named alone has guesses for both."""
+    assert main(["init", "pull.csv", "--law", "myocardium"]) == 0
+    assert main(["init", "pull.csv", "--law", "guccione", "--out", "alone.toml"]) == 0
+    scenes = [read_scene(table / f"{name}_scene.toml") for name in ("pull_guccione", "alone")]
+    for name, published in OF_LAWS["guccione"].items():
+        prior, guess = ({p.name: p.prior for p in scene.parameters}[name] for scene in scenes)
+        if name == "C":
+            assert prior == guess
+        else:
+            assert prior == published
+            assert prior.source == published.source
+            assert guess.log_sd > 2.0 * published.log_sd
 
 
 def test_a_law_that_does_not_suit_is_left_out_and_named(table, capsys):

@@ -136,13 +136,15 @@ def _weight_notes(scene: Scene) -> Iterator[str]:
 def _init_specimen(table_path: Path, out: Path, law: str | None, arguments: Namespace) -> Answer:
     """Write the files for a table, and list the guesses."""
     from calibrate.project.specimen import draft_specimen
+    from emulator.scenes.tissue_priors import LAWS_OF_TISSUES
 
     if arguments.unit is not None:
         raise InputError(
             "--unit has no effect on a table: its columns have units, 'stress_x [MPa]'"
         )
     tube = None if arguments.tube is None else _tube(arguments.tube)
-    draft = draft_specimen(table_path, out, law=law, tube=tube)
+    tissue = next((word for word in arguments.law if law in LAWS_OF_TISSUES.get(word, ())), None)
+    draft = draft_specimen(table_path, out, law=law, tissue=tissue, tube=tube)
     result = {
         "out": str(draft.path),
         "scene": str(draft.scene_path),
