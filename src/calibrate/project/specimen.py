@@ -21,7 +21,7 @@ from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.draft import prior_lines
 from emulator.scenes.file import read_scene
 from emulator.scenes.parameter_space import LogNormal, Parameter
-from emulator.scenes.tissue_priors import MYOCARDIUM, OF_LAWS
+from emulator.scenes.tissue_priors import published_exponents
 from emulator.specimens.specimen import (
     Specimen,
     likely_names,
@@ -87,8 +87,7 @@ def draft_specimen(
     out : the experiment file, ``NAME.toml``; the scene is ``NAME_scene.toml`` beside it.
     law : name of the law; by default two families of fibres for tests that pull along two axes,
         an isotropic exponential else.
-    tissue : the tissue, from whose published exponents of the law those of the specimen get their
-        priors; moduli follow from the table.
+    tissue : the tissue whose published exponents of the law are priors; moduli follow from data.
     tube : the sector of a tube.
 
     Raises
@@ -114,15 +113,12 @@ def draft_specimen(
     material = find_law(law or chosen)
     of_law = f"law {material.name}" + ("" if law else ": a guess, give --law NAME")
     notes = _notes(cells, of_law, measured, slope, tube)
-    folder = scene_path.resolve().parent
-    source = table.resolve()
+    source, folder = table.resolve(), scene_path.resolve().parent
     name = source.relative_to(folder) if source.is_relative_to(folder) else source
     scene_path.parent.mkdir(parents=True, exist_ok=True)
     pulled = bool(states.pulls.any())
-    published = OF_LAWS.get(material.name, {}) if tissue == MYOCARDIUM else {}
-    without_unit = {quantity.name for quantity in material.quantities if not quantity.unit}
-    exponents = {name: published[name] for name in published.keys() & without_unit}
-    text = _scene_text(material, name.as_posix(), axes, slope, exponents, tube, pulled=pulled)
+    published = published_exponents(material, tissue)
+    text = _scene_text(material, name.as_posix(), axes, slope, published, tube, pulled=pulled)
     if tube is None and not pulled:
         text += "\n".join(["", *_GRIPS, ""])
     scene_path.write_text(text, encoding="utf-8")

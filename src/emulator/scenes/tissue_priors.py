@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from emulator.core.errors import look_up
-from emulator.mechanics.laws import LAWS
+from emulator.mechanics.laws import LAWS, Law
 from emulator.scenes.parameter_space import LogNormal
 
 _HUMAN = (
@@ -104,6 +104,13 @@ def laws_named(words: Sequence[str]) -> tuple[str, ...]:
         look_up({**LAWS, **LAWS_OF_TISSUES}, word, "law or tissue")
     names = (name for word in words for name in LAWS_OF_TISSUES.get(word, (word,)))
     return tuple(dict.fromkeys(names))
+
+
+def published_exponents(law: Law, tissue: str | None) -> dict[str, LogNormal]:
+    """Return the published priors of a law's parameters without a unit, for a tissue or none."""
+    published = OF_LAWS.get(law.name, {}) if tissue == MYOCARDIUM else {}
+    names = {quantity.name for quantity in law.quantities if not quantity.unit}
+    return {name: prior for name, prior in published.items() if name in names}
 
 
 PRESSURE = LogNormal(1.07, 0.44, _FILLED)
