@@ -98,9 +98,12 @@ def posterior_summary(report: Mapping[str, Any]) -> str:
     if "certificate" not in report:
         lines.append("not checked against FEM yet: calibrate certify")
     else:
+        from calibrate.certificate.verdict import NO_TAIL
+
         c = report["certificate"]
         basis = f"{c['draws']} FEM runs, {c['failed']} failed"
-        if c["k_hat"] is not None and math.isfinite(c["k_hat"]):
+        has_tail = c.get("tail", {}).get("largest", math.inf) >= NO_TAIL  # else k is of no tail
+        if has_tail and c["k_hat"] is not None and math.isfinite(c["k_hat"]):
             basis = f"Pareto k {c['k_hat']:.2f}, at most {c['k_threshold']:.2f}; {basis}"
         lines.append(f"verdict: {report['verdict']} ({basis}): {c['reason']}")
         lines += [f"- {finding}" for finding in c["findings"] if finding != c["reason"]]

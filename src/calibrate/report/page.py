@@ -19,7 +19,7 @@ from markupsafe import Markup
 from calibrate.analysis.identifiability import identify, in_words
 from calibrate.analysis.terms import HeldOut, find_terms
 from calibrate.certificate.evidence import LARGEST_LOG_SD, LARGEST_MESH_SHIFT, LARGEST_SHIFT
-from calibrate.certificate.verdict import shifts
+from calibrate.certificate.verdict import NO_TAIL, shifts
 from calibrate.posterior import Posterior
 from calibrate.priors.population import in_words as priors_in_words
 from calibrate.priors.priors import Truncated
@@ -126,7 +126,8 @@ def _basis(certificate: dict[str, Any]) -> Iterator[str]:
     runs = f"Judged by {certificate['draws']} FEM runs, {certificate['failed']} failed"
     yield f"{runs}, and {mesh['runs']} {where}." if mesh.get("runs") else f"{runs}."
     k, most = certificate["k_hat"], certificate["k_threshold"]
-    if k is not None and most is not None:
+    has_tail = certificate.get("tail", {}).get("largest", math.inf) >= NO_TAIL
+    if has_tail and k is not None and most is not None:
         yield f"Pareto k {k:.2f}, at most {most:.2f}."
     yield (
         f"Limits: {LARGEST_SHIFT:g} sd for a mean, {LARGEST_MESH_SHIFT:g} {where}, "

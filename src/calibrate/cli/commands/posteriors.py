@@ -47,48 +47,7 @@ if TYPE_CHECKING:
     "--out DIR",
 )
 def infer(arguments: Namespace) -> Answer:
-    """Sample and certify a posterior, or one by each of several laws, and save them."""
-    from calibrate.cli.run_words import problem_of
-    from calibrate.posterior import read_tree
-    from calibrate.posterior.comparison import compare, require_same_data
-    from calibrate.project.results import POSTERIOR
-
-    budget = math.inf if arguments.budget is None else seconds(arguments.budget)
-    scenes = [arguments.scene, *arguments.others]
-    if len(scenes) == 1:
-        return _infer_one(arguments, budget)
-    runs = {
-        Path(scene).stem: Namespace(
-            **{**vars(arguments), "scene": scene, "out": f"{arguments.out}/{Path(scene).stem}"}
-        )
-        for scene in scenes
-    }
-    if len(runs) < len(scenes):
-        raise InputError("infer: two scenes have one name; each gets a folder of its name")
-    check_folder(arguments.out)
-    data = {name: problem_of(run).data for name, run in runs.items()}
-    measured = {name: values for name, values in data.items() if values is not None}
-    if len(measured) < len(data):
-        raise InputError("infer: several laws need data that were measured: --data FILE")
-    require_same_data(measured)
-    answers = {name: _infer_one(run, budget / len(runs)) for name, run in runs.items()}
-    trees = {run.out: read_tree(Path(run.out) / POSTERIOR) for run in runs.values()}
-    comparison = compare(trees)
-    result = {
-        "runs": {name: answer.result for name, answer in answers.items()},
-        "comparison": {**asdict(comparison), "verdict": comparison.verdict},
-    }
-    texts = [f"{name}\n{answer.text}\n" for name, answer in answers.items()]
-    then = f"calibrate predict {' '.join(trees)} --scene OTHER mixes them"
-    text = "\n".join([*texts, comparison_summary(comparison), then])
-    return Answer(result, text, all(answer.usable for answer in answers.values()))
-
-
-def _infer_one(arguments: Namespace, budget: float) -> Answer:
-    """Sample and certify a posterior, or those of members of a population, and save them.
-
-    budget : the time for it, s.
-    """
+    """Sample and certify a posterior, or those of members or of several laws, and save them."""
     from calibrate.cli.run_words import plan_of
     from calibrate.project import (
         Problem,
@@ -100,9 +59,12 @@ def _infer_one(arguments: Namespace, budget: float) -> Answer:
         report,
     )
 
+    if arguments.others:
+        return _infer_several(arguments)
     folder, progress = check_folder(arguments.out), not arguments.json
     plan, force, certify = plan_of(arguments), arguments.force, not arguments.no_certify
     begin = time.perf_counter()
+    budget = math.inf if arguments.budget is None else seconds(arguments.budget)
     written = f"written to {arguments.out}; its page: calibrate report {arguments.out}"
     if not isinstance(plan, Run | Problem):
         return _infer_members(plan, arguments, written)
@@ -135,6 +97,41 @@ def _infer_one(arguments: Namespace, budget: float) -> Answer:
     result = report(run, posterior, certificate)
     usable = certificate is None or certificate.verdict == "accepted"
     return Answer(result, f"{posterior_summary(result)}\n{written}", usable)
+
+
+def _infer_several(arguments: Namespace) -> Answer:
+    """Sample and certify a posterior by each of several laws, and compare them."""
+    from calibrate.cli.run_words import problem_of
+    from calibrate.posterior import read_tree
+    from calibrate.posterior.comparison import compare, require_same_data
+    from calibrate.project.results import POSTERIOR
+
+    scenes = [arguments.scene, *arguments.others]
+    budget = arguments.budget and f"{seconds(arguments.budget) / len(scenes):g}s"
+    alone = {**vars(arguments), "others": [], "budget": budget}
+    runs = {
+        name: Namespace(**{**alone, "scene": scene, "out": f"{arguments.out}/{name}"})
+        for name, scene in ((Path(scene).stem, scene) for scene in scenes)
+    }
+    if len(runs) < len(scenes):
+        raise InputError("infer: two scenes have one name; each gets a folder of its name")
+    check_folder(arguments.out)
+    data = {name: problem_of(run).data for name, run in runs.items()}
+    measured = {name: values for name, values in data.items() if values is not None}
+    if len(measured) < len(data):
+        raise InputError("infer: several laws need data that were measured: --data FILE")
+    require_same_data(measured)
+    answers: dict[str, Answer] = {name: run.run(run) for name, run in runs.items()}
+    trees = {run.out: read_tree(Path(run.out) / POSTERIOR) for run in runs.values()}
+    comparison = compare(trees)
+    result = {
+        "runs": {name: answer.result for name, answer in answers.items()},
+        "comparison": {**asdict(comparison), "verdict": comparison.verdict},
+    }
+    texts = [f"{name}\n{answer.text}\n" for name, answer in answers.items()]
+    then = f"calibrate predict {' '.join(trees)} --scene OTHER mixes them"
+    text = "\n".join([*texts, comparison_summary(comparison), then])
+    return Answer(result, text, all(answer.usable for answer in answers.values()))
 
 
 def _infer_members(plan: Members, arguments: Namespace, written: str) -> Answer:
