@@ -70,7 +70,7 @@ class NewtonOptions:
     absolute : the residual in mN that is accepted whatever the forces; round-off of the forces at
         rest always is.
     max_iterations : the most iterations, of Newton's method and of stresses, over all fallbacks and
-        load levels.
+        load levels; no hard case that ends right needs more than 321 (studies/stability).
     level_iterations : the iterations after which a load level is given up and its increment halved.
     increment : the first and largest load increment, as a fraction of the load. Small increments
         follow the loading path from rest, for bodies with several equilibria (docs/experiments.md,
@@ -89,7 +89,7 @@ class NewtonOptions:
     tolerance: float = 1e-11
     round_off: float = 1e-8
     absolute: float = 0.0
-    max_iterations: int = 400
+    max_iterations: int = 330
     level_iterations: int = 40
     increment: float = 1.0
     min_increment: float = 1.0 / 256.0
