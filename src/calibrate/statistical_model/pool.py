@@ -196,9 +196,9 @@ class Pool(WeightedPoints):
     def sd_error(self) -> float:
         r"""The largest Monte Carlo error of the log sd of an unknown, on its scale.
 
-        By the delta method, with weights :math:`w` and distances :math:`c` to the mean, it is
-        :math:`\tfrac12 \{\sum_i w_i^2 (c_i^2 / \sigma^2 - 1)^2\}^{1/2}` for the sd
-        :math:`\sigma` of the corrected posterior.
+        The delta method gives :math:`\tfrac12 \{\sum_i w_i^2 (c_i^2 / \sigma^2 - 1)^2\}^{1/2}`
+        for the sd :math:`\sigma` of the corrected posterior, whose points have the weights
+        :math:`w` and the distances :math:`c` to the mean.
         """
         x = self.predictive.on_scales(self.predictive.columns(self.z))
         used = self.corrected > 0.0  # far away a scale may be infinite

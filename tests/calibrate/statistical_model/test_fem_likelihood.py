@@ -114,6 +114,19 @@ def test_states_of_a_draw_start_from_the_state_before(pulled, monkeypatch):
     assert len(tasks[3].starts) == 2
 
 
+@pytest.mark.parametrize("kept", [None, {}])
+def test_the_map_starts_last_unless_the_solutions_teach_it(pulled, monkeypatch, kept):
+    """The solver takes the last start of a body that is known under load."""
+    simulator, tasks = em.Simulator(pulled.forward.scene), _solved(monkeypatch)
+    fem = FEMLikelihood(pulled, simulator, kept=kept)
+    list(fem.equilibria([{"mu": 70.0, "lam": 80.0}]))
+    list(fem.equilibria([{"mu": 75.0, "lam": 80.0}]))
+    by_map = pulled.full(pulled.forward.scene.theta(mu=75.0, lam=80.0, pull=1.0))
+    starts = tasks[2].starts
+    assert len(starts) == 2
+    np.testing.assert_allclose(starts[-1 if kept is None else 0], by_map, atol=1e-12)
+
+
 def test_a_draw_that_fails_in_one_state_is_not_solved_in_another(pulled, monkeypatch):
     tasks = _solved(monkeypatch, fails=True)
     draws = [{"mu": 70.0, "lam": 80.0}, {"mu": 90.0, "lam": 80.0}]

@@ -86,6 +86,15 @@ def test_from_rest_by_stress_iterates_then_newton(ventricle_simulator, inside_ji
     np.testing.assert_allclose(inside.displacement, state.newton.u, atol=1e-10)
 
 
+def test_the_limit_counts_stress_iterates(ventricle_simulator):
+    """From rest the schedule alone takes more than two steps."""
+    scene = ventricle_simulator.scene
+    solution = em.Simulator(scene, em.fem.NewtonOptions(max_iterations=2)).solve(scene.centre)
+    assert solution.status == em.fem.Status.ITERATION_LIMIT
+    assert solution.iterations == solution.factorisations == 2
+    assert jnp.isfinite(solution.displacement).all()
+
+
 @pytest.mark.slow
 def test_jit_takes_the_iterations_that_python_takes(ventricle_simulator, inside_jit):
     theta = ventricle_simulator.scene.centre

@@ -153,20 +153,14 @@ def at_once(simulator: EquilibriumSolver, nodes: int | None = None) -> int:
 
 
 def in_order[T, R](
-    function: Callable[[T], R],
-    tasks: Iterator[T],
-    workers: int,
-    *,
-    alone: int = 1,
-    ahead: int | None = None,
+    function: Callable[[T], R], tasks: Iterator[T], workers: int, *, alone: int = 1
 ) -> Iterator[R]:
     """Yield ``function`` of every task, in the order of the tasks, by ``workers`` threads.
 
     The first ``alone`` tasks come before the threads, which use what they compile. Then a task is
-    taken when all but ``ahead`` of the results before it have been yielded, by default all but
-    ``workers``. So what a task is made of, such as a start from earlier rows, does not depend on
-    which thread was quicker; with more ahead, fewer tasks wait for a slow one. While the threads
-    work, as many factors are kept as there are threads.
+    taken when all but ``workers`` of the results before it have been yielded. So what a task is
+    made of, such as a start from earlier rows, does not depend on which thread was quicker. While
+    the threads work, as many factors are kept as there are threads.
     """
     for task in islice(tasks, alone):
         yield function(task)
@@ -180,7 +174,7 @@ def in_order[T, R](
         try:
             for task in tasks:
                 pending.append(pool.submit(on_thread, task))
-                if len(pending) > (workers if ahead is None else ahead):
+                if len(pending) > workers:
                     yield pending.popleft().result()
             while pending:
                 yield pending.popleft().result()
