@@ -361,22 +361,22 @@ class System:
         return self._compiled(solve)(tangent, rhs)
 
     def attempt(
-        self, tangent: jax.Array, rhs: jax.Array, *, may_reuse: bool = True
+        self, tangent: jax.Array, rhs: jax.Array, accuracy: Number = 0.0
     ) -> tuple[jax.Array, jax.Array]:
         """Return ``x`` (f,) with ``K x = rhs`` by Cholesky, and the outcome.
 
         INDEFINITE, and NaN, where K is symmetric and not positive definite. On a large mesh the
-        factor of an earlier tangent may serve, where the arguments are numbers; ``may_reuse`` says
-        whether this tangent may resemble the earlier one.
+        factor of an earlier tangent may serve, where the arguments are numbers, to the relative
+        ``accuracy``; with 0 the tangent is factorised.
         """
         if self.kept is not None and not is_traced(tangent, rhs):
-            return self.kept.attempt(tangent, rhs, may_reuse=may_reuse)
+            return self.kept.attempt(tangent, rhs, accuracy)
         return self._compiled(attempt)(tangent, rhs)
 
     def is_definite(self, tangent: jax.Array) -> bool:
         """Return whether a tangent of numbers is positive definite: it is factorised to see it."""
         zero = jnp.zeros(len(self.free))
-        return int(self.attempt(tangent, zero, may_reuse=False)[1]) == Outcome.OK
+        return int(self.attempt(tangent, zero)[1]) == Outcome.OK
 
     def _compiled(self, how: Callable[..., Any]) -> Callable[..., Any]:
         """Return ``how`` with the tangent's pattern, compiled once."""

@@ -37,9 +37,9 @@ def test_an_indefinite_tangent_is_solved_another_way(cube, monkeypatch):
     expected, attempt = simulator(theta), System.attempt
     calls = []  # a scene without ramps is on its last route at once
 
-    def refuse_twice(self, tangent, rhs, *, may_reuse=True):
+    def refuse_twice(self, tangent, rhs, accuracy):
         calls.append(1)
-        x, outcome = attempt(self, tangent, rhs, may_reuse=may_reuse)
+        x, outcome = attempt(self, tangent, rhs, accuracy)
         if len(calls) <= 2:
             return jnp.full_like(x, jnp.nan), jnp.asarray(Outcome.INDEFINITE, jnp.int32)
         return x, outcome

@@ -157,8 +157,8 @@ def by_python(simulator, theta, start=None):
 def test_no_tangent_on_the_way_is_indefinite(ventricle, monkeypatch):
     simulator, outcomes, attempt = em.Simulator(ventricle), [], System.attempt
 
-    def noting(self, tangent, rhs, *, may_reuse=True):
-        x, outcome = attempt(self, tangent, rhs, may_reuse=may_reuse)
+    def noting(self, tangent, rhs, accuracy):
+        x, outcome = attempt(self, tangent, rhs, accuracy)
         outcomes.append(int(outcome))
         return x, outcome
 

@@ -24,10 +24,11 @@ from emulator.fem.linear.suitesparse import (
     on_all_cores,
 )
 
-TOLERANCE = 1e-10  # relative residual, in the norm of the inverse factorised tangent
 _PATIENCE = 6  # iterations before conjugate gradients that converge too slowly are given up
-# Unknowns from which conjugate gradients beside a factor beat a factorisation by CHOLMOD, and the
-# iterations that then take as long. Times grow as n^2 and n^(4/3) (docs/experiments.md).
+_LEAST = 60_000  # unknowns from which a kept factor pays
+# Unknowns at which so many iterations of conjugate gradients take as long as a factorisation by
+# CHOLMOD; times grow as n^(4/3) and n^2 (docs/experiments.md, "Steps solved to one part in a
+# hundred").
 _LARGE = 100_000
 _ITERATIONS_OF_LARGE = 25
 
@@ -36,11 +37,13 @@ class Gradients(NamedTuple):
     """The result of conjugate gradients.
 
     x : the solution, (f,). reduction : the relative residual (), in the preconditioner's norm.
+    iterations : their number, ().
     convex : whether every direction had positive curvature, ().
     """
 
     x: jax.Array
     reduction: jax.Array
+    iterations: jax.Array
     convex: jax.Array
 
 
@@ -58,7 +61,7 @@ def conjugate_gradients(
     precondition: Callable[[jax.Array], jax.Array],
     b: jax.Array,
     steps: int,
-    tolerance: float,
+    tolerance: jax.Array | float,
     patience: int | None = None,
 ) -> Gradients:
     """Solve ``product(x) = b`` for ``x`` (f,).
@@ -95,7 +98,8 @@ def conjugate_gradients(
     start = _GradientIterate(jnp.array(0), jnp.zeros_like(b), b, first, begin, jnp.array(True))
     state = while_loop(running, step, start)
     reduction = jnp.sqrt(jnp.abs(state.size) / jnp.where(begin > 0.0, begin, 1.0))
-    return Gradients(state.x, reduction, state.convex & jnp.isfinite(state.size))
+    convex = state.convex & jnp.isfinite(state.size)
+    return Gradients(state.x, reduction, state.k, convex)
 
 
 class KeptFactor:
@@ -110,6 +114,7 @@ class KeptFactor:
     def __init__(self, pattern: Pattern) -> None:
         self._pattern = pattern
         self._factorised: jax.Array | None = None  # the tangent that the kept factor belongs to
+        self._serves = False  # whether the next tangent is worth a try with it
         affordable = int(_ITERATIONS_OF_LARGE * (pattern.size / _LARGE) ** (2.0 / 3.0))
         self._iterations = max(_PATIENCE, affordable)
         self._product = compiled(pattern.product)
@@ -120,31 +125,35 @@ class KeptFactor:
     @staticmethod
     def pays(pattern: Pattern) -> bool:
         """Return whether the matrices are large enough for a kept factor to save time."""
-        return pattern.upper and pattern.size >= _LARGE
+        return pattern.upper and pattern.size >= _LEAST
 
-    def attempt(self, tangent: jax.Array, b: jax.Array, *, may_reuse: bool = True) -> Solved:
+    def attempt(self, tangent: jax.Array, b: jax.Array, accuracy: jax.Array | float) -> Solved:
         """Return ``x`` (f,) with ``K x = b``, and the outcome.
 
-        may_reuse : whether the kept factor may serve; otherwise ``tangent`` is factorised and kept.
+        accuracy : the largest residual relative to ``b``, in the norm of the inverse factorised
+            tangent, that conjugate gradients may leave; 0 for a factor of ``tangent`` itself.
         """
-        if may_reuse and self._factorised is not None:
-            solution = self._solve_beside(tangent, self._factorised, b)
-            if bool(solution.convex & (solution.reduction <= TOLERANCE)):
+        if self._serves and float(accuracy) > 0.0:
+            solution = self._solve_beside(tangent, self._factorised, b, accuracy)
+            # A factor that needs many iterations costs more, from step to step, than a new one.
+            self._serves = int(solution.iterations) <= self._iterations // 2
+            if bool(solution.convex & (solution.reduction <= accuracy)):
                 return solution.x, jnp.asarray(Outcome.OK, jnp.int32)
         self._factorised = None
         # Two factors of a large mesh may not fit into memory.
         with on_all_cores(b.size), keeping_factors(1):
             x, outcome = jax.block_until_ready(self._solve(tangent, b))
         self.factorisations += 1
-        if int(outcome) == Outcome.OK:
+        self._serves = int(outcome) == Outcome.OK
+        if self._serves:
             self._factorised = tangent
         return x, outcome
 
     def _conjugate_gradients(
-        self, tangent: jax.Array, factorised: jax.Array, b: jax.Array
+        self, tangent: jax.Array, factorised: jax.Array, b: jax.Array, accuracy: jax.Array
     ) -> Gradients:
         def precondition(residual: jax.Array) -> jax.Array:
             return self._solve(factorised, residual)[0]
 
         product = partial(self._product, tangent)
-        return conjugate_gradients(product, precondition, b, self._iterations, TOLERANCE, _PATIENCE)
+        return conjugate_gradients(product, precondition, b, self._iterations, accuracy, _PATIENCE)

@@ -55,7 +55,8 @@ def test_two_iterations_are_those_of_the_textbook():
 
 @pytest.fixture
 def any_mesh_is_large(monkeypatch):
-    """Every mesh keeps a factor, as those of 100 000 unknowns and more do."""
+    """Every mesh keeps a factor, as those of 60 000 unknowns and more do."""
+    monkeypatch.setattr("emulator.fem.linear.reuse._LEAST", 50)
     monkeypatch.setattr("emulator.fem.linear.reuse._LARGE", 50)
 
 
@@ -99,6 +100,7 @@ def test_answers_beside_a_kept_factor_are_those_without(monkeypatch):
         return simulator, found
 
     usual, expected = answers()
+    monkeypatch.setattr("emulator.fem.linear.reuse._LEAST", 50)
     monkeypatch.setattr("emulator.fem.linear.reuse._LARGE", 50)
     keeping, found = answers()
     assert usual.system.kept is None
@@ -133,11 +135,11 @@ def test_a_kept_factor_refuses_what_is_not_definite(ventricle):
     kept = KeptFactor(system.pattern)
     K = ventricle.tangent(ventricle(scene.centre), scene.centre)
     b = jnp.asarray(np.random.default_rng(0).normal(size=system.pattern.size))
-    x, outcome = kept.attempt(K, b)
+    x, outcome = kept.attempt(K, b, 1e-10)
     assert outcome == Outcome.OK
-    np.testing.assert_allclose(kept.attempt(1.001 * K, b)[0], x / 1.001, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(kept.attempt(1.001 * K, b, 1e-10)[0], x / 1.001, rtol=1e-6, atol=1e-9)
     assert kept.factorisations == 1
     diagonal = system.pattern.rows == system.pattern.columns
-    x, outcome = kept.attempt(K - K.max() * diagonal, b)
+    x, outcome = kept.attempt(K - K.max() * diagonal, b, 1e-10)
     assert outcome == Outcome.INDEFINITE
     assert jnp.isnan(x).all()
