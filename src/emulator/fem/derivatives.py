@@ -33,6 +33,7 @@ from emulator.core.errors import SolverError
 from emulator.fem.assembly import System
 from emulator.fem.compiled import compiled, is_traced, one_by_one
 from emulator.fem.fallbacks import find_equilibrium
+from emulator.fem.linear.suitesparse import on_all_cores
 from emulator.fem.newton import NewtonOptions
 from emulator.fem.solution import Solution
 from emulator.scenes.scene import Scene
@@ -124,8 +125,9 @@ def derivatives_along(
 
 def sensitivities(system: System, u: jax.Array, theta: jax.Array) -> jax.Array:
     """Return the derivatives (p, n, 3) of the equilibrium ``u`` in each entry of theta."""
-    tangent = system.safe_tangent(u, theta)[0]
-    return derivatives_along(system, tangent, u, theta, jnp.eye(len(theta)))
+    tangent, directions = system.safe_tangent(u, theta)[0], jnp.eye(len(theta))
+    with on_all_cores(len(system.free)):
+        return jax.block_until_ready(derivatives_along(system, tangent, u, theta, directions))
 
 
 def require_finite(scene: Scene, derivatives: jax.Array, what: str) -> jax.Array:
