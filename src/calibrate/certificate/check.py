@@ -156,14 +156,15 @@ def examine(
             while True:
                 training, pool = _train(solver, z, training, known, modes, count, most, rng)
                 rows, log_drawn = pool.tests(total - len(training.z), rng)
-                tests = Tests(pool, solver(pool.z[rows], slopes=True), rows, log_drawn)
+                tests = Tests(pool, solver(pool.z[rows]), rows, log_drawn)
                 runs = FEMRuns.joined([training, tests.runs])
                 evidence = evidence_of(posterior, at_draws, training, tests, len(modes), rng)
                 count = _further_runs(total, most) if time.perf_counter() < deadline else 0
                 if judge(evidence).verdict != "undecided" or not count:
                     break
                 # The earlier tests train the next correction, and fresh points test it.
-                training, total = runs, total + count
+                training = FEMRuns.joined([training, solver.with_slopes(tests.runs)])
+                total += count
                 bar.total = total
         bar.close()
         with stages("finer mesh"):
