@@ -23,6 +23,7 @@ import emulator as em
 AWAY = 0.03  # relative distance of a neighbour in every entry of theta
 SPARE = 3  # theta for the choice of settings; the first is not timed
 LIMIT = 1800.0  # s
+_BLAS = ("OMP", "OPENBLAS")
 PROGRAM = Path(__file__).with_name("fenicsx_solver.py")
 Arrays = dict[str, Any]
 
@@ -57,26 +58,30 @@ def _load(scene: em.Scene, load: object) -> Arrays:
     raise em.InputError(f"scene '{scene.name}': FEniCSx is not told of {type(load).__name__}")
 
 
-def solve(python: str, problem: Arrays) -> Arrays:
-    """What ``fenicsx_solver.py`` finds, run by ``python``."""
+def solve(python: str, problem: Arrays, program: Path = PROGRAM, threads: int | None = 1) -> Arrays:
+    """What another code finds: ``program``, run by ``python``; FEniCSx's by default.
+
+    threads : the threads of its BLAS; None for as many as it likes.
+    """
     with TemporaryDirectory() as folder:
         task, answer = Path(folder) / "problem.npz", Path(folder) / "solutions.npz"
         np.savez(task, **problem)
         done = subprocess.run(
-            [python, PROGRAM, task, answer],
-            capture_output=True, text=True, check=False, timeout=LIMIT, env=_environment(),
+            [python, program, task, answer],
+            capture_output=True, text=True, check=False, timeout=LIMIT, env=_environment(threads),
         )  # fmt: skip
         if done.returncode:
-            raise SystemExit(f"FEniCSx by {Path(python).name}: {done.stderr[-2000:]}")
+            raise SystemExit(f"{program.stem} by {Path(python).name}: {done.stderr[-2000:]}")
         with np.load(answer, allow_pickle=False) as file:
             return dict(file)
 
 
-def _environment() -> dict[str, str]:
-    """This process's environment without the variables of this Python, one thread."""
+def _environment(threads: int | None) -> dict[str, str]:
+    """This process's environment without the variables of this Python."""
     ours = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
     kept = {name: value for name, value in os.environ.items() if name not in ours}
-    return kept | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    each = {} if threads is None else {f"{blas}_NUM_THREADS": str(threads) for blas in _BLAS}
+    return kept | each
 
 
 # ---- the same by both ------------------------------------------------------------------------

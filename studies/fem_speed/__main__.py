@@ -1,10 +1,11 @@
 """How fast the finite elements are: against other codes, by size, and where the time goes.
 
-    python -m studies.fem_speed --published DIR [--fenics PYTHON]
+    python -m studies.fem_speed --published DIR [--fenics PYTHON] [--peers PYTHON]
     python -m studies.fem_speed --quick --out DIR    # a small plate, a small beam, two small cubes
 
 Writes results.json and speed.png, and asserts what the README of the study says. FEniCSx is
-skipped where ``--fenics`` (or CALIBRATE_FENICS) names no interpreter that has it.
+skipped where ``--fenics`` (or CALIBRATE_FENICS) names no interpreter that has it, torch-fem and
+FElupe where ``--peers`` (or CALIBRATE_PEERS) names none.
 """
 
 import json
@@ -15,7 +16,7 @@ from pathlib import Path
 
 from studies.common.output import Case, Results, parser
 from studies.common.processes import run
-from studies.fem_speed import increments, where
+from studies.fem_speed import increments, peers, where
 from studies.fem_speed.codes import SEED, compare
 from studies.fem_speed.figures import draw, tables
 from studies.fem_speed.problems import plate, ventricle
@@ -60,6 +61,8 @@ def check(cases: list[Case], *, quick: bool) -> None:
         assert case["status"] in ("converged", "done"), (case["name"], case["status"])
         assert case.get("difference", 0.0) <= 1e-6, case["name"]
         assert case.get("gradient_error", 0.0) <= 1e-4, case["name"]
+        theirs = [case[code] for code in peers.PROGRAMS if code in case]
+        assert all(code["difference"] <= 1e-6 for code in theirs), case["name"]
         if "thetas" in case:
             assert case["converged"] == case["same_iterations"] == case["thetas"], case["name"]
             assert case["largest_difference"] < 1e-12, case["name"]
@@ -79,6 +82,9 @@ def main() -> None:
     words.add_argument("--published", type=Path, help="folder of the released data")
     words.add_argument(
         "--fenics", default=os.environ.get("CALIBRATE_FENICS"), help="interpreter with FEniCSx"
+    )
+    words.add_argument(
+        "--peers", default=os.environ.get("CALIBRATE_PEERS"), help="with torch-fem and FElupe"
     )
     words.add_argument("--cases", type=int, default=16, help="theta a method is timed on")
     arguments = words.parse_args()
@@ -105,6 +111,10 @@ def main() -> None:
         )
     if not arguments.fenics:
         print("FEniCSx skipped, no interpreter named (--fenics, CALIBRATE_FENICS)")
+    if not arguments.peers:
+        print("torch-fem and FElupe skipped, no interpreter named (--peers, CALIBRATE_PEERS)")
+    for name, shape in (peers.QUICK if quick else peers.BEAMS).items() if arguments.peers else ():
+        results.case(f"beam, {name}", lambda shape=shape: peers.beside(*shape, arguments.peers))
     cells = (6, 4, 2) if quick else increments.CELLS
     results.case("ten increments", lambda: increments.measured(cells))
     for edge in (3, 4) if quick else CUBES:

@@ -5,11 +5,28 @@ from pathlib import Path
 from studies.common.figures import pyplot
 from studies.common.output import Case, save
 
+OURS = "ours"
+PEERS = ("torch-fem", "FElupe")
+COLOURS = {OURS: "tab:blue", "torch-fem": "tab:orange", "FElupe": "tab:green"}
+
 
 def draw(cases: list[Case], path: Path) -> None:
-    """Times of the pressurised body, and time and memory of the cubes against their size."""
+    """Times of the pressurised body; of a beam by three codes; and of cubes, with memory."""
     plt = pyplot()
-    figure, (left, right) = plt.subplots(1, 2, figsize=(13, 4.6), layout="constrained")
+    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(17, 4.6), layout="constrained")
+    beams = [case for case in cases if "beam_s" in case]
+    for style, of in (("o-", "linear"), ("s--", "quadratic")):
+        mine = [case for case in beams if case["name"].startswith(f"beam, {of}")]
+        for code, colour in COLOURS.items() if mine else ():
+            seconds = [case["beam_s"] if code == OURS else case[code]["seconds"] for case in mine]
+            label = f"{code}, {of} tetrahedra"
+            middle.plot([c["nodes"] for c in mine], seconds, style, color=colour, label=label)
+    middle.set(xscale="log", yscale="log", xlabel="nodes", ylabel="from rest (s)")
+    middle.xaxis.set_minor_formatter("")
+    middle.set_title("a thick beam under its weight")
+    middle.grid(alpha=0.25, which="both")
+    if beams:
+        middle.legend(frameon=False)
     bars = [case for case in cases if "median_s" in case]
     names = [case["name"] for case in bars]
     colours = ["tab:blue" if name.startswith("ours") else "0.6" for name in names]
@@ -73,6 +90,20 @@ def tables(cases: list[Case]) -> str:
         for case in cases
         if "fenicsx_s" in case
     ]
+    beams = [
+        [
+            case["name"].removeprefix("beam, "),
+            str(case["nodes"]),
+            f"{case['beam_s']:.2f} s",
+            *(f"{case[c]['seconds']:.2f} s, {case[c]['times_as_long']:.1f}" for c in PEERS),
+            f"{case['beam_gradient_s']:.2f} s",
+            f"{case['torch-fem']['gradient_s']:.2f} s",
+            f"{case['iterations']}, {case['factorisations']}",
+            f"{max(case[code]['difference'] for code in PEERS):.0e}",
+        ]
+        for case in cases
+        if "beam_s" in case
+    ]
     alike = [
         [
             case["name"].removesuffix(", Python and jit"),
@@ -107,6 +138,11 @@ def tables(cases: list[Case]) -> str:
                 "| beside FEniCSx | ours | FEniCSx | times as long | ours, warm | FEniCSx, "
                 "warm | difference | FEniCSx gave up |",
                 beside,
+            ),
+            *table(
+                "| thick beam | nodes | ours | torch-fem, times as long | FElupe, times as long | "
+                "gradient, ours | torch-fem | iterations, factorisations | difference |",
+                beams,
             ),
             *table("| Python and `jit` | theta | as many iterations | largest difference |", alike),
             *table(
