@@ -95,6 +95,7 @@ def predict_on(
     observe: Observation | Mapping[str, Observation] | Observations,
     *,
     known: Mapping[str, float] | None = None,
+    another: float | None = None,
     draws: int = 1000,
     most_runs: int = 96,
     load_steps: int = 1,
@@ -110,6 +111,8 @@ def predict_on(
     observe : one observation of it, or several by name; ``volume@p8`` is one in a load state.
     known : the values of parameters that are neither the posterior's nor drawn, by
         ``parameter`` or ``parameter@state``. Others are drawn from their prior in the scene.
+    another : the log-sd of the stiffness between specimens, to predict another specimen than the
+        one that was measured; None for the same.
     draws : the number of draws. most_runs : the largest number of FEM runs.
 
     Raises
@@ -124,6 +127,8 @@ def predict_on(
     rng, several = np.random.default_rng([seed, 5]), observations(observe)
     if isinstance(learned, Posterior):
         learned = Learned.of(learned)
+    if another is not None:
+        learned = learned.of_another_specimen(another, np.random.default_rng([seed, 6]))
     target = transfer(learned, scene, several, known or {}, draws, rng)
     thetas = target.states.thetas(target.draws)
     if not isinstance(target.scene, Scene):

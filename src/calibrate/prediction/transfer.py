@@ -34,12 +34,14 @@ class Learned:
     scene : one of the bodies. draws : draws (s,) of what was inferred, by name.
     known : the parameters of the law that were not inferred, with their values.
     bodies : the forward map of each body, and theta (S, p) of its load states at the mean.
+    source : where the draws are from, in words.
     """
 
     scene: ForwardProblem
     draws: Mapping[str, np.ndarray]
     known: Mapping[str, float]
     bodies: Sequence[tuple[ForwardMap, jax.Array]]
+    source: str = "the posterior"
 
     @classmethod
     def of(cls, posterior: Posterior) -> Learned:
@@ -67,6 +69,32 @@ class Learned:
         first = members[0]
         bodies = [body for member in members for body in member.bodies]
         return cls(first.scene, hierarchy.new_member(), first.known, bodies)
+
+    def of_another_specimen(self, log_sd: float, rng: np.random.Generator) -> Learned:
+        r"""Return what was learned of one specimen, as draws of another one of the same tissue.
+
+        The stiffness of both scatters about the tissue's, so all moduli that were inferred are
+        multiplied by one factor c,
+
+        .. math:: \ln c \sim N(0, 2 s^2) .
+
+        log_sd : the log-sd s of the stiffness between specimens.
+
+        :class:`InputError` for a log-sd that is not positive, for a population, whose draws scatter
+        already, or where no modulus was inferred.
+        """
+        if not 0.0 < log_sd < np.inf:
+            raise InputError(f"scatter between specimens: log-sd {log_sd:g}; give one above 0")
+        if len(self.bodies) > 1:
+            raise InputError("another specimen: draws of a population scatter already")
+        moduli = {q.name for q in self.scene.law.quantities if q.unit} & set(self.draws)
+        if not moduli:
+            raise InputError("another specimen: the posterior has no modulus that could scatter")
+        count = len(next(iter(self.draws.values())))
+        factor = np.exp(np.sqrt(2.0) * log_sd * rng.standard_normal(count))
+        draws = {n: v * factor if n in moduli else v for n, v in self.draws.items()}
+        source = f"{self.source}, for another specimen (stiffness with log-sd {log_sd:.2g} between)"
+        return replace(self, draws=draws, source=source)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +188,7 @@ def transfer(
     for name in states.unknowns:
         base = split(name)[0]
         if name in inferred and base in material:
-            draws[name], sources[base] = inferred[name][rows], "the posterior"
+            draws[name], sources[base] = inferred[name][rows], learned.source
         else:
             sample = priors[name].sample(key_from(rng), (len(rows),))
             draws[name], sources[name] = np.asarray(sample), _prior_in_words(scene, base)

@@ -16,6 +16,7 @@ from emulator.core.errors import InputError, SolverError
 from emulator.fem.campaign import workers
 from emulator.fem.solution import Status
 from emulator.scenes.parameter_space import LogNormal, Parameter
+from emulator.scenes.tissue_priors import scatter_of
 from emulator.specimens.homogeneous import homogeneous
 from emulator.specimens.states import states
 from emulator.surrogates.taylor import expand
@@ -317,3 +318,39 @@ def test_from_a_specimen_to_a_body_and_to_another_test_by_command(tmp_path, caps
         complaint = capsys.readouterr().err
         assert words in complaint
         assert complaint.count("\n") == 1
+
+
+def test_another_specimen_is_as_much_stiffer_in_all_its_moduli(posterior, shorter):
+    """Stiffness differs by the scatter of both, and a specimen's ratios stay its own."""
+    learned, rng = Learned.of(posterior), np.random.default_rng(3)
+    other = learned.of_another_specimen(0.4, rng)
+    factor = np.log(other.draws["mu"] / learned.draws["mu"])
+    np.testing.assert_allclose(np.log(other.draws["lam"] / learned.draws["lam"]), factor)
+    assert factor.std() == pytest.approx(np.sqrt(2.0) * 0.4, rel=0.1)
+    tip = cal.nodal_displacements(shorter, "right")
+    same = predict_on(posterior, shorter, tip, draws=100)
+    wide = predict_on(posterior, shorter, tip, draws=100, another=0.4)
+    assert "for another specimen" in wide.sources["mu"]
+    sunk = [np.log(np.abs(p.values["displacement"][:, 0, 2])).std() for p in (same, wide)]
+    assert sunk[1] > 3.0 * sunk[0]
+
+
+@pytest.mark.parametrize("log_sd", [0.0, -0.4, np.nan, np.inf])
+def test_a_scatter_that_is_none_is_refused(posterior, log_sd):
+    with pytest.raises(InputError, match="give one above 0"):
+        Learned.of(posterior).of_another_specimen(log_sd, np.random.default_rng(0))
+
+
+def test_what_cannot_scatter_is_refused(posterior):
+    learned, rng = Learned.of(posterior), np.random.default_rng(0)
+    with pytest.raises(InputError, match="scatter already"):
+        replace(learned, bodies=2 * learned.bodies).of_another_specimen(0.4, rng)
+    with pytest.raises(InputError, match="no modulus"):
+        replace(learned, draws={"pressure": np.ones(3)}).of_another_specimen(0.4, rng)
+
+
+def test_a_scatter_is_named_by_its_tissue_or_a_number():
+    assert scatter_of("myocardium") == 0.55
+    assert scatter_of("0.3") == 0.3
+    with pytest.raises(InputError, match="give a tissue"):
+        scatter_of("heart")

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 _OF_MEMBERS = "of members, see calibrate report"
 _ROWS = 24  # numbers of a prediction that a table shows
-_OF_POSTERIOR = ("observe", "weights", "draws", "most_runs", "load_steps", "seed")
+_OF_POSTERIOR = ("observe", "weights", "another", "draws", "most_runs", "load_steps", "seed")
 """Options beside --scene."""
 
 
@@ -43,6 +43,9 @@ _OF_POSTERIOR = ("observe", "weights", "draws", "most_runs", "load_steps", "seed
     option("--observe", "WORDS", "of OTHER, as of infer: volume, landmarks:24, ..."),
     option("--weights", "KIND", "of several RUNs: stacking, which predicts best what was left out "
            "(default), evidence or equal", choices=["stacking", "evidence", "equal"]),
+    option("--another", "TISSUE|LOG_SD", "predict another specimen than the one measured: its "
+           "stiffness scatters by what is published of a tissue (artery, clot, muscle, myocardium, "
+           "rubber, skin), or by this log-sd"),
     option("--draws", "N", "of RUN (default 1000)", type=int),
     option("--most-runs", "N", "FEM runs of OTHER at most (default 96)", type=int),
     option("--load-steps", "N", "of FEM of OTHER (default 1)", type=int),
@@ -82,6 +85,7 @@ def _on_another_scene(arguments: Namespace) -> Answer:
     from calibrate.prediction.transfer import made_of
     from calibrate.state_names import split
     from emulator.catalogue import find_problem
+    from emulator.scenes.tissue_priors import scatter_of
 
     if arguments.error_bar:
         raise InputError("--error-bar is of an emulator at one theta, without --scene")
@@ -103,6 +107,8 @@ def _on_another_scene(arguments: Namespace) -> Answer:
         for name in ("draws", "most_runs", "load_steps")
         if (value := getattr(arguments, name)) is not None
     }
+    if arguments.another is not None:
+        options["another"] = scatter_of(arguments.another)
     predictions = {}
     for name, learned in bodies.items():
         of_law = made_of(scene, learned.scene) if several else scene

@@ -137,7 +137,9 @@ def test_a_kept_factor_refuses_what_is_not_definite(ventricle):
     b = jnp.asarray(np.random.default_rng(0).normal(size=system.pattern.size))
     x, outcome = kept.attempt(K, b, 1e-10)
     assert outcome == Outcome.OK
-    np.testing.assert_allclose(kept.attempt(1.001 * K, b, 1e-10)[0], x / 1.001, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(
+        kept.attempt(1.001 * K, b, 1e-10)[0], x / 1.001, rtol=1e-6, atol=1e-9
+    )
     assert kept.factorisations == 1
     diagonal = system.pattern.rows == system.pattern.columns
     x, outcome = kept.attempt(K - K.max() * diagonal, b, 1e-10)
