@@ -113,8 +113,12 @@ def main() -> None:
         print("FEniCSx skipped, no interpreter named (--fenics, CALIBRATE_FENICS)")
     if not arguments.peers:
         print("torch-fem and FElupe skipped, no interpreter named (--peers, CALIBRATE_PEERS)")
-    for name, shape in (peers.QUICK if quick else peers.BEAMS).items() if arguments.peers else ():
-        results.case(f"beam, {name}", lambda shape=shape: peers.beside(*shape, arguments.peers))
+    beams = (peers.QUICK if quick else peers.BEAMS) if arguments.peers else {}
+    for name, (shape, order) in beams.items():
+        results.case(
+            f"beam, {name}",
+            lambda shape=shape, order=order: peers.beside(shape, order, arguments.peers),
+        )
     cells = (6, 4, 2) if quick else increments.CELLS
     results.case("ten increments", lambda: increments.measured(cells))
     for edge in (3, 4) if quick else CUBES:

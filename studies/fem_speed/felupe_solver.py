@@ -23,7 +23,7 @@ def main() -> None:
     kind, region_of = REGIONS[elements.shape[1]]
     held = np.zeros(len(problem["nodes"]), dtype=bool)
     held[problem["held"]] = True
-    columns = {"seconds": [], "iterations": [], "displacement": []}
+    columns: dict[str, list] = {"seconds": [], "iterations": [], "displacement": []}
     for mu, lam in problem["theta"]:
         mesh = felupe.Mesh(problem["nodes"], elements, kind)
         field = felupe.FieldContainer([felupe.Field(region_of(mesh), dim=3)])

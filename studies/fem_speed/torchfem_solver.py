@@ -32,7 +32,7 @@ def main() -> None:
     problem = np.load(sys.argv[1], allow_pickle=False)
     nodes, elements = (torch.tensor(problem[name]) for name in ("nodes", "elements"))
     force, held = (torch.tensor(problem[name]) for name in ("force", "held"))
-    columns = {"seconds": [], "gradient_s": [], "displacement": []}
+    columns: dict[str, list] = {"seconds": [], "gradient_s": [], "displacement": []}
     for theta in problem["theta"]:
         moduli = torch.tensor(theta, requires_grad=True)
         material = Hyperelastic3D(energy, moduli.expand(len(elements), 2))

@@ -32,6 +32,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from tqdm import tqdm
 
 from calibrate.certificate.estimates import Tests, evidence_of
 from calibrate.certificate.mesh import mesh_change
@@ -162,9 +163,9 @@ def examine(
                 count = _further_runs(total, most) if time.perf_counter() < deadline else 0
                 if judge(evidence).verdict != "undecided" or not count:
                     break
-                # The earlier tests train the next correction, and fresh points test it.
-                training = FEMRuns.joined([training, solver.with_slopes(tests.runs)])
-                total += count
+                # Earlier tests, whose solutions are kept, train with slopes; fresh points test.
+                learned = replace(solver, bar=tqdm(disable=True))(tests.runs.z, slopes=True)
+                training, total = FEMRuns.joined([training, learned]), total + count
                 bar.total = total
         bar.close()
         with stages("finer mesh"):

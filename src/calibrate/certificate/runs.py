@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jax.flatten_util import ravel_pytree
@@ -112,11 +112,14 @@ class FEMRunner:
         """
         keys = [point.tobytes() for point in z]
         new = list(dict.fromkeys(key for key in keys if key not in self._known))
-        rows = [keys.index(key) for key in new]
+        draws, rows = self.predictive.constrain(z), [keys.index(key) for key in new]
+        new_draws = [{name: values[s] for name, values in draws.items()} for s in rows]
         examined = {k for k, s in enumerate(rows) if s < stability}
         self.bar.update(len(keys) - len(new))
         if new:
-            solved = self._many(z[rows], stability=examined, slopes=slopes)
+            solved = self.likelihood.many(
+                new_draws, self.predictive.data, stability=examined, slopes=slopes
+            )
             for k, likelihoods in solved:
                 self._known[new[k]] = likelihoods
                 self.bar.update()
@@ -130,20 +133,6 @@ class FEMRunner:
             tuple(f.stable for f in runs),
             tuple(f.slopes for f in runs),
         )
-
-    def with_slopes(self, runs: FEMRuns) -> FEMRuns:
-        """Return ``runs`` with slopes where FEM converged; no point counts as solved again."""
-        lacking = [k for k in np.flatnonzero(runs.converged) if runs.slopes[k] is None]
-        slopes = list(runs.slopes)
-        for number, likelihoods in self._many(runs.z[lacking], slopes=True) if lacking else ():
-            slopes[lacking[number]] = likelihoods.slopes
-        return runs._replace(slopes=tuple(slopes))
-
-    def _many(self, z: np.ndarray, **options: Any) -> Iterable[tuple[int, Likelihoods]]:
-        """Return :meth:`FEMLikelihood.many` of points (s, p)."""
-        columns = self.predictive.constrain(z)
-        draws = [{name: values[s] for name, values in columns.items()} for s in range(len(z))]
-        return self.likelihood.many(draws, self.predictive.data, **options)
 
 
 def correction_from(

@@ -34,6 +34,7 @@ from emulator.core.errors import InputError, SolverError
 from emulator.core.machine import one_blas_thread
 from emulator.core.rooms import offered
 from emulator.fem.campaign import Field
+from emulator.fem.solution import EquilibriumSolver
 from emulator.scenes.forward_problem import ForwardProblem
 from emulator.scenes.scene import Scene
 from emulator.surrogates.discrepancy import maximin_subset
@@ -130,11 +131,24 @@ def predict_on(
     if another is not None:
         learned = learned.of_another_specimen(another, np.random.default_rng([seed, 6]))
     target = transfer(learned, scene, several, known or {}, draws, rng)
-    thetas = target.states.thetas(target.draws)
     if not isinstance(target.scene, Scene):
-        return _of_states(learned, target, several, thetas)
+        return _of_states(learned, target, several)
     simulator = simulator_of(target.scene, load_steps)
+    return _of_body(simulator, target, several, most_runs, rng, progress=progress)
+
+
+def _of_body(
+    simulator: EquilibriumSolver,
+    target: Transfer,
+    several: Observations,
+    most_runs: int,
+    rng: np.random.Generator,
+    *,
+    progress: bool,
+) -> Predicted:
+    """Return the predictions of a body, which is solved by FEM at a few draws."""
     kept: dict[bytes, Field] = {}
+    assert isinstance(target.scene, Scene)
     at_rest = Emulator(target.scene).cache()
     with one_blas_thread(), counting(
         total=_BEGIN + _TESTS, desc="FEM at draws", disable=not progress, unit="run"
@@ -146,6 +160,7 @@ def predict_on(
         z = predictive.unconstrain(target.draws)
         values, runs, missed = _by_process(solver, z, most_runs, rng)
     emulator, _ = add_discrepancy(Emulator(target.scene), runs_of(kept))
+    thetas = target.states.thetas(target.draws)
     shaped = jax.vmap(several.unravel)(jnp.asarray(values))
     failed = int((~runs.converged).sum())
     warnings = _faults(failed, len(runs.z), missed)
@@ -206,9 +221,7 @@ def _by_process(
         runs = FEMRuns.joined([runs, tests])
 
 
-def _of_states(
-    learned: Learned, target: Transfer, observe: Observations, thetas: jax.Array
-) -> Predicted:
+def _of_states(learned: Learned, target: Transfer, observe: Observations) -> Predicted:
     """Return the predictions of a specimen, whose states are solved at each draw.
 
     They keep their volume where those that the draws were learned on did.
@@ -216,6 +229,7 @@ def _of_states(
     incompressible = all(getattr(body, "incompressible", False) for body, _ in learned.bodies)
     (homogeneous,) = offered("emulator.specimens.homogeneous", "homogeneous")
     forward = homogeneous(target.scene, incompressible=incompressible)
+    thetas = target.states.thetas(target.draws)
     data, valid = jax.jit(lambda t: jax.lax.map(observe.through(forward), t))(thetas)
     valid = np.asarray(valid)
     failed = int((~valid).sum())

@@ -192,9 +192,9 @@ def _before_runs(model: Model, scene: Scene) -> tuple[Model, DataProcess]:
     """Return the model by a process that knows nothing, and the process: the body is at rest."""
     draws = model.prior_draws(jax.random.key(0), 1)
     thetas = model.states.thetas({name: values[0] for name, values in draws.items()})
-    # Not by the map, which moves the supports, and the elements beside them may be inverted.
-    at_rest = np.zeros((len(thetas), len(model.observe.nodes), 3))
-    constant = np.asarray(ravel_pytree(model.observe(jnp.asarray(at_rest), thetas))[0])
+    # Not by the map: it moves the supports, which may invert the elements beside them.
+    undeformed = jnp.zeros((len(thetas), len(model.observe.nodes), 3))
+    constant = np.asarray(ravel_pytree(model.observe(undeformed, thetas))[0])
     process = no_process(model.question, constant, len(model.states.unknowns))
     full = taught(Emulator(scene), process)
     return replace(model, full=full, forward=full.at(model.observe.nodes)), process

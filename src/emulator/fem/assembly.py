@@ -365,9 +365,8 @@ class System:
     ) -> tuple[jax.Array, jax.Array]:
         """Return ``x`` (f,) with ``K x = rhs`` by Cholesky, and the outcome.
 
-        INDEFINITE, and NaN, where K is symmetric and not positive definite. On a large mesh the
-        factor of an earlier tangent may serve, where the arguments are numbers, to the relative
-        ``accuracy``; with 0 the tangent is factorised.
+        INDEFINITE, and NaN, where K is symmetric and not positive definite. On a large mesh and for
+        numbers, the factor of an earlier tangent may serve, to the relative ``accuracy`` above 0.
         """
         if self.kept is not None and not is_traced(tangent, rhs):
             return self.kept.attempt(tangent, rhs, accuracy)
@@ -383,11 +382,6 @@ class System:
         if how not in self.programs:
             self.programs[how] = compiled(partial(how, self.pattern))
         return self.programs[how]
-
-    @property
-    def stepwise(self) -> bool:
-        """Whether solves from Python go step by step, as a kept factor asks."""
-        return self.kept is not None
 
     @cached_property
     def kept(self) -> KeptFactor | None:

@@ -90,7 +90,7 @@ def differentiable(
         tangent = system.safe_tangent(u, theta)[0]
         return derivatives_along(system, tangent, u, theta, direction[None])[0]
 
-    return implicit(stepwise if system.stepwise else program, derivative)
+    return implicit(program if system.kept is None else stepwise, derivative)
 
 
 def implicit(

@@ -43,6 +43,7 @@ from emulator.fem.assembly import System
 from emulator.fem.compiled import compiled, cond, while_loop
 from emulator.fem.formulations import Linearised, formulation_of
 from emulator.fem.linear import Outcome
+from emulator.fem.linear.reuse import ACCURACY
 from emulator.fem.solution import NewtonState
 
 # Relative residual below which the residual alone judges a step, and Newton's method takes over
@@ -57,9 +58,6 @@ _LEAST_MONOTONE = 2.0**-6
 _SMALLEST_HALVED = 0.02
 ARMIJO = 1e-4  # textbook value; the energy rarely comes close to this bound
 _ROUND_OFF = 1e-13  # relative to the energy's parts; smaller decreases are round-off
-# Relative residual of a step's equations where a kept factor serves (docs/experiments.md, "Steps
-# solved to one part in a hundred").
-_ACCURACY = 0.01
 _SINGULAR = 1e13  # ratio of step to force over stiffness from which the tangent is singular
 
 
@@ -170,7 +168,7 @@ def newton_step(
     u, load = state.u, state.load
     equations = formulation_of(system).linearise(state, theta)  # residual and tangent
     force = equations.residual + equations.offset_force
-    solution, outcome = system.attempt(equations.tangent, -force, _ACCURACY)
+    solution, outcome = system.attempt(equations.tangent, -force, ACCURACY)
     indefinite = outcome == Outcome.INDEFINITE
     again = indefinite & allow_indefinite
     solution = cond(again, lambda: system.solve(equations.tangent, -force), lambda: solution)

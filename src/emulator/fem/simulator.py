@@ -90,8 +90,8 @@ class Simulator(TableRepr):
 
     @property
     def stepwise(self) -> bool:
-        """Whether solves from Python take one compiled step after the other."""
-        return not self.scene.loaded_by and self.system.stepwise
+        """Whether solves from Python go step by step, as a kept factor asks."""
+        return not self.scene.loaded_by and self.system.kept is not None
 
     @property
     def rest(self) -> jax.Array:

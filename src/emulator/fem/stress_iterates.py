@@ -40,6 +40,7 @@ from emulator.fem.condensation import block_derivatives
 from emulator.fem.energy import at_points, law_gradients
 from emulator.fem.formulations.displacement import Linearised
 from emulator.fem.linear import Outcome
+from emulator.fem.linear.reuse import OF_A_START
 from emulator.fem.material_point import MaterialPoint
 from emulator.fem.newton import largest_admissible
 from emulator.mechanics.measures import measures_read
@@ -47,9 +48,6 @@ from emulator.scenes.scene import Scene
 from emulator.scenes.tissue import Tissue
 
 _SHORTEST = 2.0**-4  # fraction of a step below which the schedule of loads has failed
-# Relative residual of the equations beside a kept factor, from a start (docs/experiments.md, "Steps
-# solved to one part in a hundred").
-_ACCURACY = 0.1
 
 
 class StressState(NamedTuple):
@@ -124,8 +122,7 @@ class StressIterates:
             factors = known * load_stiffness, known * geometric
             equations = _equations(system, state.u, state.measures, theta, load, *factors)
             force = equations.residual + equations.offset_force
-            # From rest tangents change so much that the last factor does not help.
-            accuracy = jnp.where(again, 0.0, _ACCURACY)
+            accuracy = jnp.where(again, 0.0, OF_A_START)  # no factor helps on the way from rest
             solution, outcome = system.attempt(equations.tangent, -force, accuracy)
             definite = outcome == Outcome.OK
             if system.forces:  # the tangent is not symmetric, so check that the step descends

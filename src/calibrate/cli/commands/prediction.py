@@ -85,7 +85,6 @@ def _on_another_scene(arguments: Namespace) -> Answer:
     from calibrate.prediction.transfer import made_of
     from calibrate.state_names import split
     from emulator.catalogue import find_problem
-    from emulator.scenes.tissue_priors import scatter_of
 
     if arguments.error_bar:
         raise InputError("--error-bar is of an emulator at one theta, without --scene")
@@ -101,14 +100,7 @@ def _on_another_scene(arguments: Namespace) -> Answer:
     shares = {} if weights is None else weights.by(arguments.weights or "stacking")
     scene, known = find_problem(arguments.scene), words.assignments(arguments.theta)
     states = tuple(dict.fromkeys(state for _, state in map(split, known) if state)) or ("",)
-    seed = 0 if arguments.seed is None else arguments.seed
-    options = {
-        name: value
-        for name in ("draws", "most_runs", "load_steps")
-        if (value := getattr(arguments, name)) is not None
-    }
-    if arguments.another is not None:
-        options["another"] = scatter_of(arguments.another)
+    seed, options = arguments.seed or 0, _options(arguments)
     predictions = {}
     for name, learned in bodies.items():
         of_law = made_of(scene, learned.scene) if several else scene
@@ -139,6 +131,17 @@ def _on_another_scene(arguments: Namespace) -> Answer:
         result["files"] = output.write(predicted, beyond, outer, result, folder)
         text += f"\nwritten to {folder}: {', '.join(result['files'])}"
     return Answer(result, text, not predicted.warnings)
+
+
+def _options(arguments: Namespace) -> dict[str, Any]:
+    """Return the options of a prediction that are not left to their defaults."""
+    from emulator.scenes.tissue_priors import scatter_of
+
+    names = ("another", "draws", "most_runs", "load_steps")
+    options = {name: v for name in names if (v := getattr(arguments, name)) is not None}
+    if "another" in options:
+        options["another"] = scatter_of(options["another"])
+    return options
 
 
 def _learned(runs: list[str]) -> tuple[dict[str, Learned], dict[str, str], Weights | None]:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from emulator.fem.compiled import compiled, while_loop
+from emulator.fem.compiled import Number, compiled, while_loop
 from emulator.fem.linear.pattern import Pattern
 from emulator.fem.linear.suitesparse import (
     Outcome,
@@ -27,10 +27,15 @@ from emulator.fem.linear.suitesparse import (
 _PATIENCE = 6  # iterations before conjugate gradients that converge too slowly are given up
 _LEAST = 60_000  # unknowns from which a kept factor pays
 # Unknowns at which so many iterations of conjugate gradients take as long as a factorisation by
-# CHOLMOD; times grow as n^(4/3) and n^2 (docs/experiments.md, "Steps solved to one part in a
-# hundred").
+# CHOLMOD; times grow as n^(4/3) and n^2.
 _LARGE = 100_000
 _ITERATIONS_OF_LARGE = 25
+
+ACCURACY, OF_A_START = 0.01, 0.1
+"""Relative residual to which a step is solved beside a kept factor; and that of a start's stresses.
+
+docs/experiments.md, "Steps solved to one part in a hundred".
+"""
 
 
 class Gradients(NamedTuple):
@@ -61,7 +66,7 @@ def conjugate_gradients(
     precondition: Callable[[jax.Array], jax.Array],
     b: jax.Array,
     steps: int,
-    tolerance: jax.Array | float,
+    tolerance: Number,
     patience: int | None = None,
 ) -> Gradients:
     """Solve ``product(x) = b`` for ``x`` (f,).
@@ -113,7 +118,7 @@ class KeptFactor:
 
     def __init__(self, pattern: Pattern) -> None:
         self._pattern = pattern
-        self._factorised: jax.Array | None = None  # the tangent that the kept factor belongs to
+        self._factorised = jnp.zeros(0)  # the tangent that the kept factor belongs to
         self._serves = False  # whether the next tangent is worth a try with it
         affordable = int(_ITERATIONS_OF_LARGE * (pattern.size / _LARGE) ** (2.0 / 3.0))
         self._iterations = max(_PATIENCE, affordable)
@@ -127,7 +132,7 @@ class KeptFactor:
         """Return whether the matrices are large enough for a kept factor to save time."""
         return pattern.upper and pattern.size >= _LEAST
 
-    def attempt(self, tangent: jax.Array, b: jax.Array, accuracy: jax.Array | float) -> Solved:
+    def attempt(self, tangent: jax.Array, b: jax.Array, accuracy: Number) -> Solved:
         """Return ``x`` (f,) with ``K x = b``, and the outcome.
 
         accuracy : the largest residual relative to ``b``, in the norm of the inverse factorised
@@ -139,7 +144,6 @@ class KeptFactor:
             self._serves = int(solution.iterations) <= self._iterations // 2
             if bool(solution.convex & (solution.reduction <= accuracy)):
                 return solution.x, jnp.asarray(Outcome.OK, jnp.int32)
-        self._factorised = None
         # Two factors of a large mesh may not fit into memory.
         with on_all_cores(b.size), keeping_factors(1):
             x, outcome = jax.block_until_ready(self._solve(tangent, b))
@@ -150,7 +154,7 @@ class KeptFactor:
         return x, outcome
 
     def _conjugate_gradients(
-        self, tangent: jax.Array, factorised: jax.Array, b: jax.Array, accuracy: jax.Array
+        self, tangent: jax.Array, factorised: jax.Array, b: jax.Array, accuracy: Number
     ) -> Gradients:
         def precondition(residual: jax.Array) -> jax.Array:
             return self._solve(factorised, residual)[0]
