@@ -17,10 +17,12 @@ from calibrate.prediction.beyond import Beyond
 from calibrate.prediction.predict import Predicted
 from calibrate.state_names import in_state, split
 from emulator.core.store import write_json, write_netcdf
+from emulator.fem.fields import element_means
 from emulator.geometry.io import write_vtu
 from emulator.scenes.scene import Scene
 
-_FIELD_DRAWS = 100  # draws of which a field's mean and sd are taken
+_FIELD_DRAWS = 100  # draws of which a field's mean, sd and quantiles are taken
+_STRESS_AND_STRAIN = ("cauchy_stress", "green_lagrange")
 PREDICTION = "prediction.nc"
 
 
@@ -86,15 +88,35 @@ def write(
 
 
 def write_fields(predicted: Predicted, state: int, folder: Path) -> str:
-    """Write mean and sd of the displacement of the body in a load state; return the file's name."""
+    """Write displacement, stress and strain of the body in a load state; return the file's name.
+
+    Each as its mean over draws, and by component sd and quantiles of 5 and 95 %: displacement in mm
+    at the nodes, Cauchy stress in kPa and Green-Lagrange strain as means over elements, nine
+    components, row by row. Where the mesh is the loaded shape, stress and strain are left out.
+    """
     scene = predicted.scene
     assert isinstance(scene, Scene), "a specimen has no mesh"
-    name = predicted.observe.states[state]
-    u = jax.lax.map(predicted.forward, predicted.thetas[:_FIELD_DRAWS, state])
-    data = {"displacement": np.asarray(u.mean(axis=0)), "sd": np.asarray(u.std(axis=0))}
+    name, thetas = predicted.observe.states[state], predicted.thetas[:_FIELD_DRAWS, state]
+    u = jax.lax.map(predicted.forward, thetas)
+    cells: dict[str, list[np.ndarray]] = {}
+    if not scene.loaded_by:
+        means = element_means(scene)
+        rows = [means(*pair) for pair in zip(u, thetas, strict=True)]
+        for kind in _STRESS_AND_STRAIN:
+            each = np.stack([np.asarray(row[kind]) for row in rows])
+            flat = each.reshape(len(each), len(scene.mesh.elements), -1)
+            cells |= {key: [field] for key, field in _over_draws(kind, flat).items()}
     file = f"body_{name}.vtu" if name else "body.vtu"
-    write_vtu(folder / file, scene.mesh, point_data=data)
+    points = _over_draws("displacement", np.asarray(u))
+    write_vtu(folder / file, scene.mesh, point_data=points, cell_data=cells)
     return file
+
+
+def _over_draws(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
+    """Return mean, sd and quantiles of a field's draws (s, ...), by the names of arrays."""
+    low, high = np.quantile(values, (0.05, 0.95), axis=0)
+    sd = values.std(axis=0)
+    return {name: values.mean(axis=0), f"{name}_sd": sd, f"{name}_low": low, f"{name}_high": high}
 
 
 def bands(predicted: Predicted, beyond: Beyond, outer: Predicted, path: Path) -> None:

@@ -8,6 +8,7 @@ with :math:`P_a` the stress that loads add, of muscle or as the tissue lies.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -40,7 +41,7 @@ def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np
     ``fibres`` and ``deformed_fibres`` (m, 3), both of unit length, and ``fibre_stretch`` (m,); with
     regions or modes of stiffness also ``regions`` (m,) and the factor ``stiffness`` (m,).
     """
-    means = compiled(partial(_means, scene))(jnp.asarray(u), jnp.asarray(theta))
+    means = element_means(scene)(jnp.asarray(u), jnp.asarray(theta))
     fields = {name: np.asarray(values) for name, values in means.items()}
     for name in {"fibres", "deformed_fibres"} & fields.keys():
         fields[name] = unit(fields[name])
@@ -52,8 +53,16 @@ def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np
     return fields
 
 
+def element_means(scene: Scene) -> Callable[[jax.Array, jax.Array], dict[str, jax.Array]]:
+    """Return a program for the means of :func:`element_fields` at many displacements and theta.
+
+    Those of directions are not of unit length.
+    """
+    return compiled(partial(_means, scene))
+
+
 def _means(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, jax.Array]:
-    """Return the means of :func:`element_fields`; those of directions are not of unit length."""
+    """Return what :func:`element_means` does."""
     H = displacement_gradient(scene, u)
     F = H + jnp.eye(3, dtype=H.dtype)
     J = at_points(determinant, F)

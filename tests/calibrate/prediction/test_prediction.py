@@ -3,6 +3,8 @@
 import json
 from dataclasses import replace
 
+import jax
+import meshio
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ import emulator as em
 from calibrate.cli import main
 from calibrate.prediction import Learned, predict_on
 from calibrate.prediction.beyond import Beyond, _measures, how_far_beyond, widened
+from calibrate.prediction.output import write_fields
 from calibrate.samplers.laplace import LaplaceOptions
 from emulator.core.errors import InputError, SolverError
 from emulator.fem.campaign import workers
@@ -61,6 +64,23 @@ def test_what_is_predicted_is_fem_at_the_draws(predicted):
         np.testing.assert_allclose(values[k], exact, atol=0.15 * sd)
         whole = np.asarray(predicted.forward(predicted.thetas[k, 0]))
         np.testing.assert_allclose(whole[nodes], exact, atol=0.15 * sd)
+
+
+def test_fields_of_a_body_are_those_of_fem_over_the_draws(predicted, tmp_path):
+    """Its stress and strain too, of which mean and quantiles go into a file."""
+    content = meshio.read(tmp_path / write_fields(predicted, 0, tmp_path))
+    scene, thetas = predicted.scene, predicted.thetas[:100, 0]
+    simulator = em.Simulator(scene)
+    rows = [em.fem.element_fields(scene, simulator(theta), theta) for theta in thetas[::9]]
+    for name in ("cauchy_stress", "green_lagrange"):
+        low, high = (content.cell_data[f"{name}_{end}"][0] for end in ("low", "high"))
+        values = np.stack([row[name].reshape(len(low), 9) for row in rows])
+        size, mean = np.abs(values).max(), content.cell_data[name][0]
+        np.testing.assert_allclose(mean, values.mean(axis=0), atol=0.05 * size)
+        assert 0.8 < np.mean((values >= low - 1e-6 * size) & (values <= high + 1e-6 * size)) < 1.0
+    u = np.asarray(jax.lax.map(predicted.forward, thetas))
+    np.testing.assert_allclose(content.point_data["displacement"], u.mean(axis=0), atol=1e-12)
+    np.testing.assert_allclose(content.point_data["displacement_sd"], u.std(axis=0), atol=1e-12)
 
 
 def test_a_summary_is_of_the_values(predicted):
@@ -308,6 +328,8 @@ def test_from_a_specimen_to_a_body_and_to_another_test_by_command(tmp_path, caps
         ([*ask, "body.toml"], "say what to predict with --observe"),
         ([*ask, "body.toml", "--observe", "volume"], "0 cavities"),
         (["predict", "r", "--draws", "9"], "--draws has no effect without --scene"),
+        (["predict", "r", "--another", "0.3"], "--another has no effect without --scene"),
+        ([*ask, "body.toml", "--observe", "nodes:4", "--another", "heart"], "give a tissue"),
         (["predict", "r"], "r is a folder of infer: name the scene that it predicts, --scene"),
         ([*ask, "none.toml", "--observe", "nodes:4"], "none.toml"),
         (["predict", "q", "--scene", "body.toml", "--observe", "nodes:4"], "q"),
