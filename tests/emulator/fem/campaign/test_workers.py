@@ -84,7 +84,7 @@ def test_no_more_at_once_than_cores_and_memory(simulator, monkeypatch):
 
 def test_what_keeps_a_factor_or_is_not_fem_is_not_shared(simulator, monkeypatch):
     monkeypatch.setattr(workers, "cores", lambda: 8)
-    monkeypatch.setattr(type(simulator.system), "stepwise", True)
+    monkeypatch.setattr(type(simulator), "stepwise", True)
     assert at_once(simulator) == 1
     assert at_once(object()) == 1
 
