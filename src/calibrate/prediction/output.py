@@ -103,8 +103,8 @@ def write_fields(predicted: Predicted, state: int, folder: Path) -> str:
         means = element_means(scene)
         rows = [means(*pair) for pair in zip(u, thetas, strict=True)]
         for kind in _STRESS_AND_STRAIN:
-            each = np.stack([np.asarray(row[kind]) for row in rows])
-            flat = each.reshape(len(each), len(scene.mesh.elements), -1)
+            values = np.stack([np.asarray(row[kind]) for row in rows])
+            flat = values.reshape(len(values), len(scene.mesh.elements), -1)
             cells |= {key: [field] for key, field in _over_draws(kind, flat).items()}
     file = f"body_{name}.vtu" if name else "body.vtu"
     points = _over_draws("displacement", np.asarray(u))
