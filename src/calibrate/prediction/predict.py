@@ -24,6 +24,7 @@ from calibrate.noise import GaussianNoise
 from calibrate.posterior import Posterior
 from calibrate.prediction.transfer import Learned, Transfer, transfer
 from calibrate.project import simulator_of
+from calibrate.project.rounds import before_runs
 from calibrate.state_names import in_state
 from calibrate.statistical_model import FEMLikelihood, Model
 from calibrate.statistical_model.fem_likelihood import runs_of
@@ -153,7 +154,7 @@ def _of_body(
     with one_blas_thread(), counting(
         total=_BEGIN + _TESTS, desc="FEM at draws", disable=not progress, unit="run"
     ) as bar:  # fmt: skip
-        run_model = _model(at_rest, several, target)
+        run_model, _ = before_runs(_model(at_rest, several, target), target.scene)
         data = {name: jnp.zeros(shape) for name, shape in several.shapes.items()}
         predictive = Predictive(run_model, data)
         solver = FEMRunner(predictive, FEMLikelihood(run_model, simulator, kept=kept), bar)
@@ -211,12 +212,12 @@ def _by_process(
         known = [left[k] for k in rows]
         solver.bar.total = max(len(runs.z) + count, solver.bar.total)
         tests = solved(rows)
-        there, spread = (
-            tests.converged,
-            np.maximum(values.std(axis=0), 1e-12 * np.abs(values).max()),
-        )
+        there, smallest = tests.converged, max(1e-12 * np.abs(values).max(), 1e-300)
+        spread = np.maximum(values.std(axis=0), smallest)
         gap = (tests.means[there] - values[known][there]) / spread
         missed = float(np.sqrt(np.mean(gap**2))) if there.any() else np.inf
+        if there.any() and not np.isfinite(missed):
+            raise SolverError("prediction: FEM at further draws is foreseen by no finite number")
         solver.bar.set_postfix_str(f"missed by {missed:.2g} sd")
         runs = FEMRuns.joined([runs, tests])
 

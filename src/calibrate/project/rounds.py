@@ -124,7 +124,7 @@ def teach(
     """
     fingerprint = simulator.scene.fingerprint
     kept, earlier = ({}, {}) if keep is None else _read(keep, fingerprint)
-    model, blank = _before_runs(model, simulator.scene)
+    model, blank = before_runs(model, simulator.scene)
     predictive = Predictive(model, data, _noise_draws(model))
     rng = np.random.default_rng([seed, 2])
     if set(model.names) <= earlier.keys():
@@ -188,7 +188,7 @@ def _in_rounds(
     return runs, rounds
 
 
-def _before_runs(model: Model, scene: Scene) -> tuple[Model, DataProcess]:
+def before_runs(model: Model, scene: Scene) -> tuple[Model, DataProcess]:
     """Return the model by a process that knows nothing, and the process: the body is at rest."""
     draws = model.prior_draws(jax.random.key(0), 1)
     thetas = model.states.thetas({name: values[0] for name, values in draws.items()})

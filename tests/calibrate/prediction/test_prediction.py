@@ -92,6 +92,32 @@ def test_a_summary_is_of_the_values(predicted):
     assert inside.mean() == pytest.approx(0.9, abs=0.02)
 
 
+def test_a_support_that_moves_past_the_elements_beside_it_is_predicted(posterior, beam):
+    """As far as a body at rest would have inverted elements; and a number that is always zero."""
+    moved = em.Support("right", (-1.0, 0.0, 0.0), amount="pressed")
+    scene = replace(
+        beam,
+        mesh=em.generators.box((20.0, 10.0, 10.0), (10, 1, 1)),
+        supports=(em.Support("left"), moved),
+        loads=(),
+        parameters=(*beam.parameters, Parameter("pressed", "", 0.1, 9.0)),
+        origin={},
+    )
+    force = {
+        "reaction": cal.Reaction(scene, "right", "x"),
+        "held": cal.nodal_displacements(scene, "left"),
+    }
+    predicted = predict_on(posterior, scene, force, known={"pressed": 4.0}, draws=60)
+    simulator = em.Simulator(predicted.scene)
+    for k in (3, 40):
+        theta = predicted.thetas[k, 0]
+        exact = float(simulator.reaction("right", simulator(theta), theta)[0]) / 1000.0
+        assert predicted.values["reaction"][k] == pytest.approx(exact, rel=2e-3)
+    assert predicted.missed <= 0.05
+    assert predicted.runs < 40
+    assert not predicted.values["held"].any()
+
+
 def test_what_the_posterior_lacks_has_its_own_prior(posterior, shorter):
     """A pressure that is given, and one that is drawn; each is named."""
     observe = cal.nodal_displacements(shorter, "right")
