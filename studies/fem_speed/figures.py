@@ -4,10 +4,11 @@ from pathlib import Path
 
 from studies.common.figures import pyplot
 from studies.common.output import Case, save
+from studies.fem_speed.peers import PROGRAMS
 
 OURS = "ours"
-PEERS = ("torch-fem", "FElupe")
-COLOURS = {OURS: "tab:blue", "torch-fem": "tab:orange", "FElupe": "tab:green"}
+PEERS = tuple(PROGRAMS)
+COLOURS = dict(zip((OURS, *PEERS), ("tab:blue", "tab:orange", "tab:green"), strict=True))
 
 
 def draw(cases: list[Case], path: Path) -> None:

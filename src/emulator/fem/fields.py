@@ -56,13 +56,13 @@ def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np
 def element_means(scene: Scene) -> Callable[[jax.Array, jax.Array], dict[str, jax.Array]]:
     """Return a program for the means of :func:`element_fields` at many displacements and theta.
 
-    Those of directions are not of unit length.
+    The means of directions are not of unit length.
     """
     return compiled(partial(_means, scene))
 
 
 def _means(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, jax.Array]:
-    """Return what :func:`element_means` does."""
+    """Return the means at one displacement and theta."""
     H = displacement_gradient(scene, u)
     F = H + jnp.eye(3, dtype=H.dtype)
     J = at_points(determinant, F)

@@ -90,7 +90,7 @@ class Simulator(TableRepr):
 
     @property
     def stepwise(self) -> bool:
-        """Whether solves from Python go step by step, as a kept factor asks."""
+        """Solves from Python go step by step where a factor is kept."""
         return not self.scene.loaded_by and self.system.kept is not None
 
     @property

@@ -123,7 +123,7 @@ def scatter_of(word: str) -> float:
         return float(word)
     except ValueError:
         known = ", ".join(SCATTER_OF_TISSUES)
-        raise InputError(f"--another {word}: give a tissue ({known}) or a log-sd") from None
+        raise InputError(f"scatter of '{word}': give a tissue ({known}) or a log-sd") from None
 
 
 def laws_named(words: Sequence[str]) -> tuple[str, ...]:

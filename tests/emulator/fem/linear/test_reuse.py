@@ -9,7 +9,7 @@ import pytest
 import emulator as em
 from emulator.accuracy.estimate import ErrorBar
 from emulator.fem.linear import Outcome
-from emulator.fem.linear.reuse import KeptFactor, conjugate_gradients
+from emulator.fem.linear.reuse import Gradients, KeptFactor, conjugate_gradients
 from emulator.geometry.generators.box import box
 from emulator.scenes import Support
 from scene_support import block
@@ -145,3 +145,17 @@ def test_a_kept_factor_refuses_what_is_not_definite(ventricle):
     x, outcome = kept.attempt(K - K.max() * diagonal, b, 1e-10)
     assert outcome == Outcome.INDEFINITE
     assert jnp.isnan(x).all()
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_a_factor_that_needs_many_iterations_is_replaced(ventricle, monkeypatch, many):
+    kept, scene = KeptFactor(ventricle.system.pattern), ventricle.scene
+    K = ventricle.tangent(ventricle(scene.centre), scene.centre)
+    b = jnp.ones(ventricle.system.pattern.size)
+    kept.attempt(K, b, 0.01)
+    iterations = jnp.array(kept._iterations // 2 + many)
+    answer = Gradients(b, jnp.array(0.0), iterations, jnp.array(True))
+    monkeypatch.setattr(kept, "_solve_beside", lambda *_: answer)
+    for _ in range(2):
+        kept.attempt(1.001 * K, b, 0.01)
+    assert kept.factorisations == 1 + many
