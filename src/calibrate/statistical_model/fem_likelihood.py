@@ -18,7 +18,7 @@ from jax.flatten_util import ravel_pytree
 from calibrate.statistical_model.model import Data, Model
 from emulator.core.errors import InputError
 from emulator.fem import Simulator
-from emulator.fem.campaign import Field, Neighbours, Runs, Solver, Task, at_once, in_order
+from emulator.fem.campaign import Field, Neighbours, Runs, Solver, Task, many_solves
 from emulator.fem.energy import volume_ratio
 from emulator.fem.solution import EquilibriumSolver
 from emulator.scenes.scene import Scene
@@ -158,10 +158,9 @@ class FEMLikelihood:
 
         solver = _DrawSolver(Solver(self.simulator, sensitivities=slopes), thetas)
         # Not under jit: there the solver cannot use CHOLMOD, which is faster.
-        workers, alone = at_once(self.simulator), int(not self._solved_before)
-        self._solved_before = True
+        alone, self._solved_before = int(not self._solved_before), True
         tasks = map(begun, unsolved.values())
-        for draw in in_order(solver, tasks, workers, alone=alone):
+        for draw in many_solves(self.simulator, solver, tasks, alone=alone):
             for row in sorted(draw.starts.keys() & draw.known.keys()):
                 self._keep(keys[row], draw.known[row])
                 near[row] = draw.known[row]

@@ -12,6 +12,7 @@ at one of them, :mod:`~emulator.fem.assembly` has residual and tangent, and
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -20,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.display import TableRepr
+from emulator.core.engine import STAYS, Engine, engine_of
 from emulator.core.errors import InputError
 from emulator.core.machine import require_cpu, require_float64
 from emulator.fem.assembly import System
@@ -51,6 +53,8 @@ class Simulator(TableRepr):
     ----------
     scene : the scene to simulate.
     options : the controls of Newton's method.
+    executor : the executor of :mod:`concurrent.futures` that does many solves, or words:
+        ``processes:4``, ``dask:ADDRESS`` (:mod:`emulator.core.engine`); by default threads.
 
     Raises
     ------
@@ -61,6 +65,9 @@ class Simulator(TableRepr):
 
     scene: Scene
     options: NewtonOptions = field(default_factory=NewtonOptions)
+    executor: Executor | str | None = field(default=None, metadata={STAYS: True})
+
+    sent_once = True
 
     def __post_init__(self) -> None:
         with_mesh(self.scene)
@@ -74,6 +81,11 @@ class Simulator(TableRepr):
         unknowns = int((~self.scene.held).sum())
         _, rows = self.scene.summary_rows()
         return f"Simulator of '{self.scene.name}'", [*rows, ("unknowns", str(unknowns))]
+
+    @cached_property
+    def engine(self) -> Engine | None:
+        """The engine that does many solves; None for threads of this process."""
+        return engine_of(self.executor)
 
     @cached_property
     def system(self) -> System:

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.core.engine import Engine
 from emulator.core.errors import SolverError
 from emulator.scenes.forward_problem import ForwardProblem
 
@@ -89,10 +90,14 @@ class EquilibriumSolver(Protocol):
     """What solves a scene or a specimen: a simulator, or the map of a specimen's states.
 
     scene : the scene or the specimen that is solved.
+    engine : the engine that does many solves; None for threads of this process.
     """
 
     @property
     def scene(self) -> ForwardProblem: ...  # noqa: D102
+
+    @property
+    def engine(self) -> Engine | None: ...  # noqa: D102
 
     def __call__(self, theta: jax.Array) -> jax.Array:
         """Return the displacement (n, 3) in mm; :class:`SolverError` when it does not converge."""

@@ -61,6 +61,8 @@ class Homogeneous:
     nodes: np.ndarray
     incompressible: bool = False
 
+    engine = None
+
     def __post_init__(self) -> None:
         require_specimen(self.scene)
         closed = np.flatnonzero(~self.scene.states.free.any(axis=1))

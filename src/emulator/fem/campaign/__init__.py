@@ -15,7 +15,7 @@ from emulator.fem.campaign.campaign import (
     solve_rows,
     solve_together,
 )
-from emulator.fem.campaign.workers import Row, Solver, Task, at_once, in_order
+from emulator.fem.campaign.workers import Row, Solver, Task, at_once, in_order, many_solves
 
 __all__ = [
     "Field",
@@ -28,6 +28,7 @@ __all__ = [
     "Task",
     "at_once",
     "in_order",
+    "many_solves",
     "run_campaign",
     "solve_rows",
     "solve_together",

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.display import counting
-from emulator.fem.campaign.workers import Row, Solver, Task, at_once, in_order
+from emulator.fem.campaign.workers import Row, Solver, Task, many_solves
 from emulator.fem.simulator import Simulator
 from emulator.fem.solution import Solution
 from emulator.scenes.scene import Scene
@@ -42,7 +42,7 @@ def solve_rows(
     """
     rows = range(len(thetas)) if numbers is None else numbers
     tasks = (Task(number, thetas[number], tuple(starts(number))) for number in rows)
-    return in_order(solver, tasks, at_once(solver.simulator))
+    return many_solves(solver.simulator, solver, tasks)
 
 
 def solve_together(simulator: Simulator, thetas: jax.Array) -> Solution:

@@ -1,4 +1,4 @@
-"""One solve of a campaign, and the threads of this process that do many.
+"""One solve of a campaign, and the threads, or the engine, that do many.
 
 A solve is one compiled program, which does not hold Python's lock, and CHOLMOD's factorisation uses
 one core. Two solves on two cores take 0.56 of the time of one after the other on a ventricle of
@@ -150,6 +150,19 @@ def at_once(simulator: EquilibriumSolver, nodes: int | None = None) -> int:
         return 1
     bytes_per_solve = _BYTES_A_NODE * (nodes or len(simulator.scene.mesh.nodes))
     return max(1, int(min(cores(), _MEMORY_SHARE * memory() / bytes_per_solve)))
+
+
+def many_solves[T, R](
+    simulator: EquilibriumSolver, solve: Callable[[T], R], tasks: Iterator[T], *, alone: int = 1
+) -> Iterator[R]:
+    """Yield ``solve`` of every task, in their order: by the simulator's engine, or by threads.
+
+    solve : the function of a task; what it holds of the simulator is sent to a worker once.
+    alone : the number of tasks that come before the others, which use what they compile.
+    """
+    if simulator.engine is not None:
+        return simulator.engine.in_order(solve, tasks, alone=alone)
+    return in_order(solve, tasks, at_once(simulator), alone=alone)
 
 
 def in_order[T, R](

@@ -1,0 +1,289 @@
+"""Engines: where many solves are done, in threads of this process or by any executor.
+
+An executor is anything with ``submit`` of :mod:`concurrent.futures`, whose futures have ``result``:
+a pool of processes, ``dask.distributed``'s ``Client.get_executor()``, ``mpi4py.futures``,
+``executorlib``. It belongs to the solver, which every place that does many solves has. What goes to
+a worker is a function, small arguments, and the digests of what they hold that is large: objects
+whose class says ``sent_once``, such as the simulator of a scene. A worker that lacks one says so,
+gets its bytes once, and then keeps what it builds and compiles of it.
+
+Bytes are pickled by this process for its own workers, and are never read from a file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import multiprocessing
+import pickle
+import sys
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
+from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import jax
+from tqdm import tqdm
+
+from emulator.core.errors import InputError, SolverError
+from emulator.core.machine import cores, one_blas_thread
+
+USAGE = "threads, processes:N or dask:ADDRESS"
+"""The words of an engine."""
+SENT_ONCE = "sent_once"
+"""Attribute of a class whose objects workers get once, and keep."""
+STAYS = "stays"
+"""Metadata of a dataclass's field that no worker gets."""
+_DEATHS = 3  # of workers, with one task, after which it is named as their cause
+_KEPT = 8  # objects that a worker keeps, the last used
+
+
+class Engine:
+    """Does tasks by an executor, in their order.
+
+    executor : the executor. workers : the number of its workers.
+    renewed : the function that returns another executor where a worker's death ends the first;
+        None where the executor replaces its workers itself, or cannot be replaced.
+    """
+
+    def __init__(
+        self, executor: Executor, workers: int, renewed: Callable[[], Executor] | None = None
+    ) -> None:
+        self.workers = workers
+        self._executor, self._renewed = executor, renewed
+
+    def in_order[T, R](
+        self, function: Callable[[T], R], tasks: Iterator[T], *, alone: int = 1
+    ) -> Iterator[R]:
+        """Yield ``function`` of every task, in the order of the tasks.
+
+        The first ``alone`` tasks come one after the other. Then a task is taken when all but
+        ``workers`` of the results before it have been yielded.
+
+        :class:`SolverError` where workers die of one task, or one dies whom nothing replaces.
+        """
+        sender, pending = _Sender(function), deque[_Sent]()
+        try:
+            for number, task in enumerate(tasks):
+                pending.append(_Sent(number, sender.packed(task)))
+                self._submit(pending, sender)
+                while len(pending) > (self.workers if number >= alone else 0):
+                    yield self._first(pending, sender)
+            while pending:
+                yield self._first(pending, sender)
+        finally:
+            for sent in pending:
+                if sent.future is not None:
+                    sent.future.cancel()
+
+    def _first(self, pending: deque[_Sent], sender: _Sender) -> Any:
+        """Return the result of the first task, which is sent again until it has one."""
+        while True:
+            self._submit(pending, sender)
+            sent = pending[0]
+            try:
+                answer = None if sent.future is None else sent.future.result()
+            except BrokenExecutor as error:
+                self._renew(pending, error)
+                continue
+            if not isinstance(answer, _Lacking):
+                pending.popleft()
+                return answer
+            sent.future, sent.with_objects = None, True
+
+    def _submit(self, pending: deque[_Sent], sender: _Sender) -> None:
+        """Submit the tasks that are not with the executor."""
+        for sent in pending:
+            while sent.future is None:
+                try:
+                    sent.future = sender.submitted(self._executor, sent)
+                except BrokenExecutor as error:  # a worker died since the last result
+                    self._renew(pending, error)
+
+    def _renew(self, pending: deque[_Sent], error: BrokenExecutor) -> None:
+        """Replace the executor; tasks that went with it are to be submitted again."""
+        first = pending[0]
+        first.deaths += 1
+        if self._renewed is None:
+            raise SolverError(
+                f"a worker died with run {first.number + 1}, and its executor cannot be replaced: "
+                f"name an engine in words ({USAGE})"
+            ) from error
+        if first.deaths >= _DEATHS:
+            raise SolverError(
+                f"{_DEATHS} workers died with run {first.number + 1}: out of memory? Take fewer"
+            ) from error
+        lost = [sent for sent in pending if sent.is_lost]
+        numbers = ", ".join(str(sent.number + 1) for sent in lost)
+        tqdm.write(f"a worker died; done again: run {numbers or first.number + 1}", file=sys.stderr)
+        self._executor = self._renewed()
+        for sent in lost:
+            sent.future = None
+
+
+@dataclass
+class _Sent:
+    """A task: its number, its bytes, and the future of its result, once it is submitted.
+
+    with_objects : whether what it holds that is large goes with it.
+    deaths : the number of workers that died while it was the first of all tasks.
+    """
+
+    number: int
+    task: bytes
+    future: Future[Any] | None = None
+    with_objects: bool = False
+    deaths: int = 0
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether it was submitted and has no result, or ended with its executor."""
+        future = self.future
+        return future is not None and (not future.done() or future.exception() is not None)
+
+
+class _Lacking(NamedTuple):
+    """The answer of a worker that lacks an object, by its digest."""
+
+    digest: str
+
+
+class _Sender:
+    """Packs a function and its tasks, and the objects that both hold, each once."""
+
+    def __init__(self, function: Callable[[Any], Any]) -> None:
+        self._objects = dict[str, bytes]()
+        self._digests = dict[int, tuple[Any, str]]()  # the object is kept, so its id is not reused
+        self._function = self._kept_by_workers(function)
+        self._cache = jax.config.jax_compilation_cache_dir
+
+    def packed(self, thing: Any) -> bytes:
+        """Return ``thing`` as bytes, with digests for the objects that are sent once."""
+        return _packed(thing, self._digest)
+
+    def _digest(self, thing: Any) -> str | None:
+        return self._kept_by_workers(thing) if getattr(type(thing), SENT_ONCE, False) else None
+
+    def _kept_by_workers(self, thing: Any) -> str:
+        """Return the digest of what workers keep."""
+        if id(thing) not in self._digests:
+            content = _packed(thing, lambda inner: None if inner is thing else self._digest(inner))
+            digest = hashlib.sha256(content).hexdigest()
+            self._objects[digest] = content
+            self._digests[id(thing)] = thing, digest
+        return self._digests[id(thing)][1]
+
+    def submitted(self, executor: Executor, sent: _Sent) -> Future[Any]:
+        """Return the future of one task."""
+        objects = self._objects if sent.with_objects else {}
+        return executor.submit(_work, self._function, sent.task, objects, self._cache)
+
+
+class _Pickler(pickle.Pickler):
+    def __init__(self, file: io.BytesIO, digest: Callable[[Any], str | None]) -> None:
+        super().__init__(file, protocol=pickle.HIGHEST_PROTOCOL)
+        self.persistent_id = digest  # type: ignore[method-assign]
+
+    def reducer_override(self, thing: Any) -> Any:
+        """Make dataclasses of these packages from their fields: not from what they compiled."""
+        if isinstance(thing, MappingProxyType):
+            return _frozen, (dict(thing),)
+        of_ours = type(thing).__module__.startswith(("emulator.", "calibrate."))
+        if of_ours and is_dataclass(thing) and not isinstance(thing, type):
+            sent = (f.name for f in fields(thing) if f.init and not f.metadata.get(STAYS))
+            values = {name: getattr(thing, name) for name in sent}
+            return _made, (type(thing), values)
+        return NotImplemented
+
+
+def _made(kind: Callable[..., Any], values: Mapping[str, Any]) -> Any:
+    return kind(**values)
+
+
+def _frozen(entries: dict[Any, Any]) -> Mapping[Any, Any]:
+    return MappingProxyType(entries)  # whose class pickle does not find by its name
+
+
+def _packed(thing: Any, digest: Callable[[Any], str | None]) -> bytes:
+    file = io.BytesIO()
+    _Pickler(file, digest).dump(thing)
+    return file.getvalue()
+
+
+# ---- in a worker ---------------------------------------------------------------------------------
+_OBJECTS: dict[str, Any] = {}
+"""What this worker was sent once, by digest, the last used at the end."""
+
+
+class _Unpickler(pickle.Unpickler):
+    def __init__(self, content: bytes, objects: Mapping[str, bytes]) -> None:
+        super().__init__(io.BytesIO(content))
+        self._sent = objects
+
+    def persistent_load(self, digest: str) -> Any:
+        """Return the object of ``digest``; ``KeyError`` where this worker was not sent it."""
+        if digest not in _OBJECTS:
+            _OBJECTS[digest] = _Unpickler(self._sent[digest], self._sent).load()
+        _OBJECTS[digest] = _OBJECTS.pop(digest)
+        while len(_OBJECTS) > _KEPT:
+            del _OBJECTS[next(iter(_OBJECTS))]
+        return _OBJECTS[digest]
+
+
+def _work(function: str, task: bytes, objects: Mapping[str, bytes], folder: str | None) -> Any:
+    """Return the function's result for one task, or which objects it lacks.
+
+    function : its digest. folder : the folder of compiled programs that JAX shares with the process that asks.
+    """
+    if folder is not None and jax.config.jax_compilation_cache_dir != folder:
+        jax.config.update("jax_compilation_cache_dir", folder)
+    try:
+        unpickler = _Unpickler(task, objects)
+        call, argument = unpickler.persistent_load(function), unpickler.load()
+    except KeyError as digest:
+        return _Lacking(str(digest))
+    with one_blas_thread():
+        return jax.block_until_ready(call(argument))
+
+
+# ---- by words ------------------------------------------------------------------------------------
+def engine_of(executor: Executor | str | None) -> Engine | None:
+    """Return the engine of an executor or of words; None for threads of this process.
+
+    :class:`InputError` for other words, or where what they name is not installed or not there.
+    """
+    if executor is None or executor == "threads":
+        return None
+    if not isinstance(executor, str):
+        if not callable(getattr(executor, "submit", None)):
+            raise InputError(f"executor is a {type(executor).__name__}; it has no submit")
+        return Engine(executor, getattr(executor, "_max_workers", None) or cores())
+    return _named(executor)
+
+
+@cache
+def _named(words: str) -> Engine:
+    """Return the engine of ``words``, of which this process has one: its workers compiled much."""
+    kind, _, rest = words.partition(":")
+    if kind == "processes" and rest.isascii() and rest.isdigit() and int(rest) > 0:
+        # Not by fork: JAX has threads.
+        context = multiprocessing.get_context("spawn")
+        renewed = lambda: ProcessPoolExecutor(int(rest), mp_context=context)  # noqa: E731
+        return Engine(renewed(), int(rest), renewed)
+    if kind == "dask" and rest:
+        try:
+            from distributed import Client
+        except ModuleNotFoundError:
+            raise InputError(f"engine '{words}': install dask and distributed") from None
+        try:
+            client = Client(rest, timeout=10)
+        except (OSError, ValueError) as error:
+            raise InputError(f"engine '{words}': {error}") from None
+        workers = sum(client.ncores().values())
+        if not workers:
+            raise InputError(f"engine '{words}': the cluster has no worker")
+        return Engine(client.get_executor(), workers)
+    raise InputError(f"engine '{words}': give {USAGE}")
