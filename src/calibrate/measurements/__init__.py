@@ -104,6 +104,15 @@ __all__ = [
 ]
 
 
+def kinds_of(scene: ForwardProblem) -> Mapping[str, type[Observation]]:
+    """Return the kinds of observation of a problem by name: of another program, its outputs."""
+    if not scene.outside:
+        return OBSERVATIONS
+    (kinds_of_outputs,) = offered("calibrate.measurements.external", "kinds_of_outputs")
+    kinds: Mapping[str, type[Observation]] = kinds_of_outputs(scene)
+    return kinds
+
+
 def parse_observation(
     scene: ForwardProblem, text: str, seed: int = 0, states: Sequence[str] = ("",)
 ) -> Observations:
@@ -129,12 +138,15 @@ def parse_observation(
 
 def _parse_word(scene: ForwardProblem, word: str, seed: int) -> tuple[str, Observation]:
     """Return name and observation; a word's part before the colon is its kind, else it is nodes."""
-    if kind := OBSERVATIONS.get(word.partition(":")[0]):
+    kinds = kinds_of(scene)
+    if kind := kinds.get(word.partition(":")[0]):
         return parse(kind, scene, word, seed)
+    if scene.outside:
+        raise InputError(f"observe '{word}': outputs of '{scene.name}' are {', '.join(kinds)}")
     if nodes := nodes_called(with_mesh(scene), word):
         return DISPLACEMENT, nodes
     raise InputError(
-        f"observe '{word}': give {'; '.join(map(usage_of, OBSERVATIONS.values()))}; "
+        f"observe '{word}': give {'; '.join(map(usage_of, kinds.values()))}; "
         f"node sets: {', '.join(sorted(with_mesh(scene).mesh.node_sets)) or 'none here'}"
     )
 
@@ -144,10 +156,12 @@ def observations_from_json(
 ) -> Observations:
     """Return the observations that :meth:`Observations.to_json` described."""
 
+    kinds = kinds_of(scene)
+
     @cache
     def made(text: str) -> Observation:
         words = json.loads(text)
-        return from_json(look_up(OBSERVATIONS, words.get("kind"), "observation kind"), scene, words)
+        return from_json(look_up(kinds, words.get("kind"), "observation kind"), scene, words)
 
     parts, entries = dict[str, Observation](), dict[str, np.ndarray]()
     for name, words in description.items():

@@ -28,7 +28,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibrate.measurements import OBSERVATIONS
+from calibrate.measurements import kinds_of
 from calibrate.measurements.collection import Observations, check_some, observations
 from calibrate.measurements.observation import (
     Block,
@@ -100,7 +100,7 @@ def _observed(
     scene: ForwardProblem, file: DataTable, state: str
 ) -> dict[str, tuple[Observation, np.ndarray]]:
     """Return the observations of one load state and their data, by name."""
-    layouts, observed = _layouts(file), {}
+    layouts, observed = _layouts(file, kinds_of(scene)), {}
     for base, (kind, layout) in layouts.items():
         name, places = in_state(base, state), _words(layout, where=True)
         sharing = [other for _, other in layouts.values() if places & _words(other, where=True)]
@@ -132,23 +132,28 @@ def _read(
     if issubclass(kind, PointObservation):
         return kind.read(scene, layout, arrays)
     part, number = parse(kind, scene, name)[1], arrays[name]
-    if number.size != 1:
+    if number.size != np.prod(part.shape):
         curve = "; rows of a loading curve have" if scene.load_parameters else ""
         curve += " or".join(f" a column '{load}'" for load in scene.load_parameters)
         raise InputError(f"{name} has {number.size} values; give one, in {part.unit}{curve}")
-    return part, number.reshape(())
+    return part, number.reshape(part.shape)
 
 
 def _words(layout: Layout, *, where: bool) -> set[str]:
     return {word for field in layout.fields if field.where is where for word in field.columns}
 
 
-def _layouts(file: DataTable) -> dict[str, tuple[type[Observation], Layout]]:
-    """Return kind and layout of each observation that the file has all columns of, by name."""
+def _layouts(
+    file: DataTable, kinds: Mapping[str, type[Observation]]
+) -> dict[str, tuple[type[Observation], Layout]]:
+    """Return kind and layout of each observation that the file has all columns of, by name.
+
+    kinds : the kinds of observation that there are, by name.
+    """
     complete: dict[str, tuple[type[Observation], Layout]] = {}
     partial: list[list[str]] = []
     used: set[str] = set()
-    for kind in OBSERVATIONS.values():
+    for kind in kinds.values():
         for name, layout in kind.layouts(file.words).items():
             words = file.words_of(layout)
             if not set(words) <= set(file.words):
@@ -172,7 +177,7 @@ def _layouts(file: DataTable) -> dict[str, tuple[type[Observation], Layout]]:
     else:
         every = " or ".join(
             ",".join(file.words_of(layout))
-            for name, kind in OBSERVATIONS.items()
+            for name, kind in kinds.items()
             for layout in kind.layouts((name,)).values()
         )
     raise InputError(f"data file {file.path}: {fault}; expected {file.what}s {every}")

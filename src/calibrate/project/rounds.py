@@ -28,7 +28,8 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from types import MappingProxyType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -58,15 +59,16 @@ from emulator.core.errors import SolverError
 from emulator.core.machine import one_blas_thread
 from emulator.core.rooms import offered
 from emulator.core.store import read_arrays, save_arrays
-from emulator.fem import Simulator
-from emulator.fem.campaign import Field
+from emulator.fem.campaign import Field, Runs
+from emulator.fem.solution import EquilibriumSolver
+from emulator.scenes.forward_problem import ForwardProblem
 from emulator.scenes.scene import Scene, with_mesh
 from emulator.surrogates import registry, shipped
 from emulator.surrogates.discrepancy import maximin_subset
 from emulator.surrogates.emulator import EMULATOR, Emulator
 from emulator.surrogates.part import widened
 from emulator.surrogates.protocol import ForwardMap
-from emulator.surrogates.taught import ROUNDS, DataProcess, TaughtEmulator, no_process, taught
+from emulator.surrogates.taught import ROUNDS, DataProcess, Taught, no_process, taught
 from emulator.training.mechanics import add_discrepancy
 
 _ARRAYS = ("theta", "displacement", "sensitivities")  # of a file of solutions
@@ -98,15 +100,15 @@ class Round:
 def teach(
     model: Model,
     data: Mapping[str, Any],
-    simulator: Simulator,
+    simulator: EquilibriumSolver,
     *,
     most: int,
     seed: int = 0,
     keep: Path | None = None,
     deadline: float = np.inf,
     progress: bool = False,
-) -> TaughtEmulator:
-    """Return an emulator of FEM runs where the posterior is; its record lists the rounds.
+) -> Taught:
+    """Return a map of FEM runs where the posterior is; its record lists the rounds.
 
     Parameters
     ----------
@@ -149,12 +151,32 @@ def teach(
         runs, rounds = _in_rounds(predictive, ask, begin, most, deadline, rng, bar)
         bar.close()
         learned = correction_from(runs, predictive, most).of_scaled(*predictive.scale_of_features)
-    emulator, record = add_discrepancy(Emulator(simulator.scene), runs_of(kept))
     at = predictive.constrain(runs.z[runs.converged])
     taught_at = {name: values.tolist() for name, values in at.items()}
-    rounds_record = {ROUNDS_RECORD: [asdict(r) for r in rounds], TAUGHT_AT: taught_at}
-    record = {"discrepancy": record, **rounds_record}
-    return taught(replace(emulator, record=record), replace(blank, correction=learned))
+    record = {ROUNDS_RECORD: [asdict(r) for r in rounds], TAUGHT_AT: taught_at}
+    process = replace(blank, correction=learned)
+    return _map_of(simulator.scene, process, runs_of(kept), record)
+
+
+def _map_of(
+    scene: ForwardProblem,
+    data: DataProcess,
+    runs: Runs | None = None,
+    record: Mapping[str, Any] = MappingProxyType({}),
+) -> Taught:
+    """Return the map of a process of data, and of the solutions ``runs``; None before the first.
+
+    record : what is told of the rounds.
+    """
+    if not isinstance(scene, Scene):
+        (taught_outputs,) = offered("emulator.external.maps", "taught_outputs")
+        of_outputs: Taught = taught_outputs(scene, data, runs, record)
+        return of_outputs
+    emulator = Emulator(scene)
+    if runs is not None:
+        emulator, of_runs = add_discrepancy(emulator, runs)
+        record = {"discrepancy": of_runs, **record}
+    return taught(replace(emulator, record=dict(record)), data)
 
 
 def _in_rounds(
@@ -188,7 +210,7 @@ def _in_rounds(
     return runs, rounds
 
 
-def before_runs(model: Model, scene: Scene) -> tuple[Model, DataProcess]:
+def before_runs(model: Model, scene: ForwardProblem) -> tuple[Model, DataProcess]:
     """Return the model by a process that knows nothing, and the process: the body is at rest."""
     draws = model.prior_draws(jax.random.key(0), 1)
     thetas = model.states.thetas({name: values[0] for name, values in draws.items()})
@@ -196,28 +218,25 @@ def before_runs(model: Model, scene: Scene) -> tuple[Model, DataProcess]:
     undeformed = jnp.zeros((len(thetas), len(model.observe.nodes), 3))
     constant = np.asarray(ravel_pytree(model.observe(undeformed, thetas))[0])
     process = no_process(model.question, constant, len(model.states.unknowns))
-    full = taught(Emulator(scene), process)
+    full = _map_of(scene, process)
     return replace(model, full=full, forward=full.at(model.observe.nodes)), process
 
 
 def by_rounds(problem: Problem) -> Problem:
     """Return the problem with a map that is taught where its scene has no emulator.
 
-    A specimen gets its states. A run that names a forward map or an emulator is returned as it is.
+    A specimen gets its states, a table of runs its rows. A run that names a forward map or an emulator is returned as it is.
     """
     run, scene = problem.run, problem.scene
     if run.forward != EMULATOR.name or run.emulator is not None:
         return problem
-    if not isinstance(scene, Scene):
-        (of_states,) = offered("emulator.specimens.homogeneous", "INCOMPRESSIBLE")
-        return read_problem(replace(run, forward=of_states.name), scene=scene)
     # A scene file may have the name of a shipped one, and finer:NAME does.
     if scene.name in shipped() and scene.origin.get("scene") == scene.name:
         return problem
-    return read_problem(replace(run, forward=ROUNDS.name), scene=scene)
+    return read_problem(replace(run, forward=scene.usual_map), scene=scene)
 
 
-def taught_map(problem: Problem, **options: Any) -> TaughtEmulator | None:
+def taught_map(problem: Problem, **options: Any) -> Taught | None:
     """Return the map that rounds of FEM runs teach; None where the run names another one.
 
     options : ``keep``, ``deadline`` and ``progress`` of :func:`teach`.
@@ -225,19 +244,18 @@ def taught_map(problem: Problem, **options: Any) -> TaughtEmulator | None:
     run = problem.run
     if run.forward != ROUNDS.name:
         return None
-    at_rest = Emulator(with_mesh(problem.scene)).cache()
-    model, data = build_model(problem, at_rest)
+    scene = problem.scene if problem.scene.outside else with_mesh(problem.scene)
+    blank = _map_of(scene, no_process("", np.zeros(0), 1))
+    model, data = build_model(problem, blank)
     model, data = replace(model, check_scale=False).given(data)
     most = registry.full_options(ROUNDS.name, run.forward_options)["most_runs"]
-    simulator = cast(Simulator, problem.simulator)
-    return teach(model, data, simulator, most=most, seed=run.seed, **options)
+    return teach(model, data, problem.simulator, most=most, seed=run.seed, **options)
 
 
 def account_of(forward: ForwardMap) -> dict[str, Any]:
     """Return the rounds, and the draws at which FEM was solved, of a map that they taught."""
-    if not isinstance(forward, TaughtEmulator):
-        return {}
-    return {name: forward.emulator.record[name] for name in (ROUNDS_RECORD, TAUGHT_AT)}
+    record = getattr(forward, "record", {})
+    return {name: record[name] for name in (ROUNDS_RECORD, TAUGHT_AT) if name in record}
 
 
 def _require_half(runs: FEMRuns) -> None:

@@ -13,7 +13,6 @@ from calibrate.state_names import split
 from calibrate.statistical_model import Model
 from emulator.core.errors import InputError
 from emulator.scenes.forward_problem import ForwardProblem
-from emulator.scenes.scene import with_mesh
 from emulator.surrogates import registry
 from emulator.surrogates.taught import ROUNDS
 
@@ -26,7 +25,7 @@ def without_box(run: Run, scene: ForwardProblem) -> tuple[Run, ForwardProblem]:
     """
     anywhere = registry.forward_kind(run.forward).anywhere and not scene.learned_in_box
     if run.forward == ROUNDS.name:
-        wide = wide_prior(with_mesh(scene), run.bounded)
+        wide = wide_prior(scene, run.bounded)
     elif not anywhere or (wide := stated_prior(scene)) is None:
         return run, scene
     if (population := completed(population_called(run.prior), wide)) is None:

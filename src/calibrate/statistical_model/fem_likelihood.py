@@ -199,9 +199,9 @@ class FEMLikelihood:
             has_energy = not cast(Simulator, self.simulator).system.forces
         if not has_energy:
             return None
-        return all(
-            self.simulator.is_stable(u, theta) for u, theta in zip(fields, thetas, strict=True)
-        )
+        states = zip(fields, thetas, strict=True)
+        stable = [self.simulator.is_stable(u, theta) for u, theta in states]
+        return None if None in stable else all(stable)
 
     def _slopes(self, solved: list[Field], thetas: jax.Array) -> np.ndarray | None:
         """Return derivatives (m, S, p) of the flat means, by those of the equilibria."""

@@ -23,6 +23,7 @@ class Status(IntEnum):
     INVALID_INPUT = 3
     SINGULAR_TANGENT = 4
     INVERTED_ELEMENT = 5
+    FAILED = 6
     RUNNING = 9
 
     @property
@@ -38,6 +39,7 @@ _TEXT = {
     Status.INVALID_INPUT: "theta or the starting displacement is not finite",
     Status.SINGULAR_TANGENT: "singular tangent: stiffness vanishes or the supports are too few",
     Status.INVERTED_ELEMENT: "an element would invert: no admissible state found at the full load",
+    Status.FAILED: "the external solver failed",
     Status.RUNNING: "still running",
 }
 
@@ -111,8 +113,8 @@ class EquilibriumSolver(Protocol):
         """Return the derivatives (p, n, 3) of the equilibrium ``u`` (n, 3) mm in ``theta``."""
         ...
 
-    def is_stable(self, u: jax.Array, theta: jax.Array) -> bool:
-        """Return whether the equilibrium ``u`` (n, 3) mm is a minimum of the energy."""
+    def is_stable(self, u: jax.Array, theta: jax.Array) -> bool | None:
+        """Return whether the equilibrium ``u`` (n, 3) mm is a minimum of the energy, if known."""
         ...
 
 

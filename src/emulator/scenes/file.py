@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -48,6 +48,11 @@ def read_scene(path: str | Path) -> ForwardProblem:
 
     path = Path(path)
     source = read_toml(path, "scene file")
+    if "solver" in source.data:
+        for read_external in offered("emulator.external.file", "read_external"):
+            problem: ForwardProblem = read_external(path, source, _parameter)
+            return problem
+        raise source.error("this needs the room 'emulator.external'", ("solver",))
     file = parse(SceneFile, source)
     with source.at("law"):
         law = find_law(file.law)
@@ -62,15 +67,18 @@ def read_scene(path: str | Path) -> ForwardProblem:
     parameters = []
     for name, entry in file.parameters.items():
         with source.at("parameters", name, table=("parameters", name)):
-            parameters.append(_parameter(name, entry, law))
+            parameters.append(_parameter(name, entry, law.quantities))
     try:
         return make(parameters=tuple(parameters), **entries, **of_body)
     except InputError as error:
         raise source.error(str(error), _quantity_in(str(error), file)) from error
 
 
-def _parameter(name: str, entry: ParameterTable, law: Law) -> Parameter:
-    """Return the parameter of a table, which has a range, or a median and a log_sd."""
+def _parameter(name: str, entry: ParameterTable, quantities: Iterable[Quantity]) -> Parameter:
+    """Return the parameter of a table, which has a range, or a median and a log_sd.
+
+    quantities : those of the law, which limit a median.
+    """
     keys = entry.model_fields_set - {"unit"}
     if {"range", "scale"} & keys and {"median", "log_sd", "source"} & keys:
         raise InputError(
@@ -81,7 +89,7 @@ def _parameter(name: str, entry: ParameterTable, law: Law) -> Parameter:
     if entry.median is None or entry.log_sd is None:
         raise InputError("give a range, or median and log_sd")
     prior = LogNormal(entry.median, entry.log_sd, entry.source)
-    limit = next((q for q in law.quantities if q.name == name), Quantity(name))
+    limit = next((q for q in quantities if q.name == name), Quantity(name))
     if fault := limit.value_fault(entry.median):
         raise InputError(f"median: {fault}")
     return Parameter.log_normal(name, entry.unit, prior, limit.high)

@@ -1,8 +1,9 @@
 """The base of scenes and specimens: a law, its parameters, and theta in its box.
 
 A :class:`~emulator.scenes.scene.Scene` adds a mesh with loads and supports, a
-:class:`~emulator.specimens.specimen.Specimen` the homogeneous states of a piece of tissue. Forward
-maps, priors and calibration need no more of either than what is here.
+:class:`~emulator.specimens.specimen.Specimen` the homogeneous states of a piece of tissue, an
+:class:`~emulator.external.problem.ExternalProblem` somebody else's solver. Forward maps, priors and
+calibration need no more of them than what is here.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import numpy as np
@@ -38,7 +39,14 @@ Owners = dict[str, tuple[Quantity, str]]
 
 
 class ForwardProblem(TableRepr):
-    """A law in tissue, its parameters and constants; the fields are those of the subclasses."""
+    """A law in tissue, its parameters and constants; the fields are those of the subclasses.
+
+    solved_by : the module and the name of the class or function that makes its solver.
+    outside : whether a program of somebody else's solves it.
+    """
+
+    solved_by: ClassVar[str] = "emulator.fem.simulator:Simulator"
+    outside: ClassVar[bool] = False
 
     name: str
     law: Law
@@ -52,6 +60,11 @@ class ForwardProblem(TableRepr):
     regions: np.ndarray | None = None
     loaded_by: Mapping[str, str] = MappingProxyType({})
     table: Cells | None = None
+
+    @property
+    def usual_map(self) -> str:
+        """The kind of forward map where a run names none."""
+        return "rounds"
 
     @property
     def learned_in_box(self) -> bool:

@@ -106,6 +106,9 @@ class Specimen(ForwardProblem):
     table: Cells | None = None
     homogeneous: bool = False
 
+    solved_by = "emulator.specimens.homogeneous:homogeneous"
+    usual_map = "incompressible"
+
     @property
     def learned_in_box(self) -> bool:
         """Say whether the stresses of grips were learned from FEM inside the box of theta."""

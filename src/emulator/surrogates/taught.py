@@ -8,13 +8,16 @@ body, and every other quantity, from an emulator of the same runs.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol, cast
 
 import numpy as np
 
 from emulator.core.errors import InputError
+from emulator.core.rooms import offered
 from emulator.core.store import inside
+from emulator.scenes.forward_problem import ForwardProblem
 from emulator.scenes.scene import Scene, all_nodes
 from emulator.surrogates.correction import Correction, no_correction
 from emulator.surrogates.emulator import PARTS, CachedEmulator, Emulator
@@ -30,6 +33,7 @@ from emulator.surrogates.protocol import (
 )
 
 _PROCESS = "data"  # prefix of the arrays of a process of data
+_OF_OUTPUTS = "emulator.external.maps"  # the room of other programs' outputs
 _SCALARS = ("length", "nugget", "scale", "local")
 
 
@@ -69,6 +73,23 @@ def no_process(question: str, constant: np.ndarray, unknowns: int) -> DataProces
     return DataProcess(question, constant, no_correction(1, unknowns, len(constant)))
 
 
+class Taught(ForwardMap, Protocol):
+    """A forward map that rounds of runs have taught.
+
+    data : the process of the data of the posterior for which the runs were made.
+    record : what is told of the rounds.
+    """
+
+    data: DataProcess
+
+    @property
+    def record(self) -> Mapping[str, Any]: ...  # noqa: D102
+
+    def arrays(self) -> Arrays:
+        """Return all that gives a value, by name."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class TaughtEmulator(CachedEmulator):
     """An emulator over some nodes, of FEM runs that were made for one posterior.
@@ -86,9 +107,19 @@ class TaughtEmulator(CachedEmulator):
         """Short hash of scene, emulator, nodes and process."""
         return fingerprint_of(super().fingerprint, *self.data.arrays().values())
 
+    @property
+    def record(self) -> Mapping[str, Any]:
+        """What is told of the rounds."""
+        return self.emulator.record
+
     def data_of(self, question: str) -> DataProcess | None:
         """Return the process of the data that ``question`` asks for; None where it is another."""
         return self.data if self.data.question == question else None
+
+    def arrays(self) -> Arrays:
+        """Return the arrays of the emulator's parts and of the process, by name."""
+        parts = {name: np.asarray(array) for name, array in arrays_of(self.emulator.parts).items()}
+        return parts | {f"{_PROCESS}/{name}": a for name, a in self.data.arrays().items()}
 
 
 def taught(emulator: Emulator, data: DataProcess) -> TaughtEmulator:
@@ -106,12 +137,14 @@ def _refuse(_: Ingredients, __: Options) -> ForwardMap:
 
 
 def _to_arrays(forward: ForwardMap) -> Arrays:
-    assert isinstance(forward, TaughtEmulator)
-    parts = {name: np.asarray(array) for name, array in arrays_of(forward.emulator.parts).items()}
-    return parts | {f"{_PROCESS}/{name}": a for name, a in forward.data.arrays().items()}
+    return cast(Taught, forward).arrays()
 
 
-def _from_arrays(scene: Scene, arrays: Arrays) -> TaughtEmulator:
+def _from_arrays(scene: ForwardProblem, arrays: Arrays) -> ForwardMap:
+    if not isinstance(scene, Scene):
+        (of_outputs,) = offered(_OF_OUTPUTS, "TaughtOutputs")
+        restored: ForwardMap = of_outputs.restored(scene, arrays)
+        return restored
     present = {name: inside(arrays, name) for name in PARTS}
     parts = {n: PARTS[n].restore(scene, {}, part) for n, part in present.items() if part}
     process = DataProcess.restore(inside(arrays, _PROCESS))

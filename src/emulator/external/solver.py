@@ -1,0 +1,85 @@
+"""An external solver as what solves an external problem: the counterpart of FEM's simulator."""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
+
+from emulator.core.engine import STAYS, Engine, engine_of
+from emulator.core.errors import SolverError
+from emulator.external.problem import Answer, ExternalProblem
+from emulator.fem.solution import Solution, Status
+
+
+@dataclass(frozen=True, eq=False)
+class ExternalSimulator:
+    """Solves an external problem; a run that fails is a solution with that status.
+
+    scene : the problem.
+    executor : the executor or the words of an engine that does many runs, as a simulator's.
+    """
+
+    scene: ExternalProblem
+    executor: Executor | str | None = field(default=None, metadata={STAYS: True})
+
+    sent_once = True
+
+    @cached_property
+    def engine(self) -> Engine | None:
+        """The engine that does many runs: the executor, or threads that wait for processes."""
+        workers = self.scene.solver.at_once
+        if self.executor is None and workers > 1:
+            return Engine(ThreadPoolExecutor(workers), workers)
+        return engine_of(self.executor)
+
+    @cached_property
+    def _answers(self) -> dict[bytes, Answer]:
+        return {}
+
+    def _answer(self, theta: np.ndarray) -> Answer:
+        """Return the answer at ``theta`` (p,), the last of which is kept for its derivatives."""
+        key = theta.tobytes()
+        if key not in self._answers:
+            answer = self.scene.solver.run(self.scene, theta)
+            self._answers.clear()
+            self._answers[key] = answer
+            return answer
+        return self._answers[key]
+
+    def solve(self, theta: jax.Array, start: jax.Array | None = None) -> Solution:  # noqa: ARG002
+        """Return the outputs at ``theta`` (p,), (n, 3) in the first column; there is no start."""
+        theta, outputs = np.asarray(theta, dtype=float), np.full(self.scene.node_count, np.nan)
+        status = Status.CONVERGED
+        try:
+            outputs = self._answer(theta).outputs
+        except SolverError as error:
+            values = ", ".join(f"{n} = {v:.6g}" for n, v in self.scene.values(theta).items())
+            tqdm.write(f"a run failed at {values}: {error}")
+            status = Status.FAILED
+        numbers = jnp.zeros((len(outputs), 3)).at[:, 0].set(outputs)
+        reached = jnp.asarray(float(status == Status.CONVERGED))
+        zero = jnp.asarray(0)
+        return Solution(numbers, jnp.asarray(int(status)), zero, zero, jnp.asarray(0.0), reached)
+
+    def __call__(self, theta: jax.Array) -> jax.Array:
+        """Return the outputs (n, 3); :class:`SolverError` where the run fails."""
+        numbers = self._answer(np.asarray(theta, dtype=float)).outputs
+        return jnp.zeros((len(numbers), 3)).at[:, 0].set(numbers)
+
+    def sensitivities(self, u: jax.Array, theta: jax.Array) -> jax.Array:
+        """Return the derivatives (p, n, 3) of the outputs; NaN where the solver gives none."""
+        slopes = self._answer(np.asarray(theta, dtype=float)).gradients
+        shape = (len(self.scene.parameters), *u.shape)
+        if slopes is None:
+            return jnp.full(shape, jnp.nan)
+        return jnp.zeros(shape).at[..., 0].set(slopes.T)
+
+    def is_stable(self, u: jax.Array, theta: jax.Array) -> bool | None:  # noqa: ARG002
+        """Return None: whether an equilibrium is a minimum is not known of another program."""
+        return None
