@@ -32,7 +32,7 @@ NoiseWord = float | dict[str, Any]
 
 MODEL = (
     "data", "truth", "known", "observe", "prior", "bounded", "noise", "noise_scale",
-    "check_scale", "forward", "emulator", "load_steps",
+    "check_scale", "forward", "emulator", "load_steps", "engine",
 )  # fmt: skip
 """Fields of a run that say which posterior is meant, besides its scene (:func:`add_scene`) and the
 forward map's options (:func:`add_forward`); ``systematic`` errors need an experiment file."""

@@ -139,6 +139,13 @@ def load_steps_option(default: int | None = 1) -> Option:
     return option("--load-steps", "N", text, type=int, default=default)
 
 
+def engine_option() -> Option:
+    """Return ``--engine``, by default the run's."""
+    from emulator.core.engine import USAGE
+
+    return option("--engine", "WORDS", f"what does many solves: {USAGE} (default the run's own)")
+
+
 def parameters(function: Callable[..., Any], arguments: Namespace) -> dict[str, Any]:
     """Return the words of the options that are called as parameters of ``function``."""
     names = inspect.signature(function).parameters

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from concurrent.futures import Executor
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -47,6 +49,7 @@ def infer(
     *,
     force: bool = False,
     check_map: bool = True,
+    executor: Executor | None = None,
     deadline: float = np.inf,
     progress: bool = False,
 ) -> Posterior:
@@ -60,6 +63,8 @@ def infer(
     force : replace the results of an earlier run in ``folder``.
     check_map : whether a few Newton steps tell how far the forward map is from what is observed;
         a certificate says so, too, and better.
+    executor : the executor of :mod:`concurrent.futures` that does many FEM solves
+        (:mod:`emulator.core.engine`); by default the run's ``engine``.
     deadline : the value of ``time.perf_counter`` by which rounds of FEM runs that teach a map end,
         whether or not they foresee FEM.
 
@@ -78,7 +83,7 @@ def infer(
     checkpoint, solutions = (target and target / name for name in (SAMPLING, SOLUTIONS))
     with nullcontext() if target is None else reserved(target, force=force):
         with stages("scene and data"):
-            problem = with_data(by_rounds(read_problem(run)))
+            problem = with_data(replace(by_rounds(read_problem(run)), executor=executor))
         with stages("forward map and model"):
             forward = taught_map(problem, keep=solutions, deadline=deadline, progress=progress)
             model, data = build_model(problem, forward, progress=progress)
@@ -116,6 +121,7 @@ def certify_and_keep(
     folder: str | Path,
     *,
     load_steps: int = 1,
+    executor: Executor | str = "threads",
     reweight_to: str | Path | None = None,
     progress: bool = False,
     **options: Any,
@@ -128,6 +134,7 @@ def certify_and_keep(
     ----------
     folder : the folder of the posterior.
     load_steps : load steps of every solve.
+    executor : the executor, or the words of the engine, that does the solves, as of :func:`infer`.
     reweight_to : the folder that the reweighted posterior is written to, ready to be certified in
         its turn, where the verdict allows it.
     progress : whether progress bars, and the seconds of each stage, are shown.
@@ -136,7 +143,7 @@ def certify_and_keep(
     """
     stages = Stages(show=progress)
     with stages("simulator"):
-        simulator = simulator_of(posterior.model.forward.scene, load_steps)
+        simulator = simulator_of(posterior.model.forward.scene, load_steps, executor)
     check = examine(posterior, simulator, stages=stages, progress=progress, **options)
     write_json(Path(folder) / CERTIFICATE, check.certificate.to_json())
     errors = check.certificate.evidence.map_errors

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Executor
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -77,6 +78,7 @@ def question(
     seed: int = 0,
     slopes: bool = False,
     options: NewtonOptions | None = None,
+    executor: Executor | str | None = None,
 ) -> Campaign:
     """Return the solves that :func:`campaign` makes."""
     if (samples is None) == (thetas is None):
@@ -93,7 +95,7 @@ def question(
             f"{len(scene.parameters)}) for {', '.join(scene.parameter_names)}"
         )
     has_energy = all(load.has_potential for load in scene.loads) and not scene.loaded_by
-    simulator = Simulator(scene, NewtonOptions() if options is None else options)
+    simulator = Simulator(scene, NewtonOptions() if options is None else options, executor)
     solver = Solver(simulator, sensitivities=slopes, energy=has_energy)
     design_record = {**design_record, "samples": len(points)}
     return Campaign(solver, points, {"design": design_record, "versions": versions()})

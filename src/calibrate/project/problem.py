@@ -9,6 +9,7 @@ observations :math:`\mathcal{O}` and its noise and errors :math:`\varepsilon`.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -41,17 +42,25 @@ from emulator.surrogates.fem import by_solver
 from emulator.surrogates.protocol import ForwardMap, Ingredients
 
 
-@kept
-def simulator_of(scene: ForwardProblem, load_steps: int = 1) -> EquilibriumSolver:
+def simulator_of(
+    scene: ForwardProblem, load_steps: int = 1, executor: Executor | str = "threads"
+) -> EquilibriumSolver:
     """Return the solver of ``scene``, which the scene keeps: a scene's is FEM's simulator.
 
     Synthetic data, forward map, certificate and report share it and what it compiles. Of 581 hard
     cases that converge 576 take fewer iterations than its most; one that does not takes minutes.
     """
+    return _simulator(scene, load_steps, executor)
+
+
+@kept
+def _simulator(
+    scene: ForwardProblem, load_steps: int, executor: Executor | str
+) -> EquilibriumSolver:
     if isinstance(scene, Scene):
-        return Simulator(scene, NewtonOptions.load_steps(load_steps, most=100))
+        return Simulator(scene, NewtonOptions.load_steps(load_steps, most=100), executor)
     (made,) = offered(*scene.solved_by.split(":"))
-    solver: EquilibriumSolver = made(scene)
+    solver: EquilibriumSolver = made(scene, executor=executor)
     return solver
 
 
@@ -63,17 +72,19 @@ class Problem:
         data files know.
     data : the data by the observation's name, NaN where a value is missing; None for synthetic
         data that has not been made (:func:`with_data`).
+    executor : what does many FEM solves in place of the run's engine.
     """
 
     run: Run
     scene: ForwardProblem
     observe: Observations
     data: Mapping[str, np.ndarray] | None
+    executor: Executor | None = None
 
     @property
     def simulator(self) -> EquilibriumSolver:
         """FEM of the scene, in the run's load steps, or the solver of the specimen."""
-        return simulator_of(self.scene, self.run.load_steps)
+        return simulator_of(self.scene, self.run.load_steps, self.executor or self.run.engine)
 
     def change(self, **entries: Any) -> Problem:
         """Return the problem with other entries of its run, of the same scene and data."""

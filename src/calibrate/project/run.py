@@ -20,6 +20,7 @@ from calibrate.noise import Noise, noise_of
 from calibrate.priors import Population
 from calibrate.state_names import split
 from calibrate.statistical_model import at_sites
+from emulator.core.engine import check_engine
 from emulator.core.errors import InputError
 from emulator.core.schema import read_json_as
 from emulator.scenes.finer import FINER
@@ -72,6 +73,8 @@ class Run:
     forward_options : the map's options by name, e.g. ``{"fem_runs": 60}``.
     load_steps : load steps in which every FEM solve follows the loading path from rest; 1 solves
         at the full load.
+    engine : what does many FEM solves: ``threads`` of this process, ``processes:N``, or
+        ``dask:ADDRESS``, a cluster whose scheduler is there.
     sampler : a name of :data:`calibrate.samplers.SAMPLERS`.
     sampler_options : the sampler's options by name, e.g. ``{"target_accept": 0.95}``.
     warmup : iterations of each chain that adapt the sampler and are not kept.
@@ -96,6 +99,7 @@ class Run:
     emulator: str | None = None
     forward_options: dict[str, Any] = field(default_factory=dict)
     load_steps: int = 1
+    engine: str = "threads"
     sampler: str = "auto"
     sampler_options: dict[str, Any] = field(default_factory=dict)
     warmup: int = 500
@@ -105,6 +109,7 @@ class Run:
 
     def __post_init__(self) -> None:
         registry.full_options(self.forward, self.forward_options)
+        check_engine(self.engine)
         registry.check_words(self.forward, emulator=self.emulator)
         least = dict.fromkeys(("warmup", "draws", "chains", "load_steps"), 1)
         for name in (*least, "seed"):

@@ -34,7 +34,7 @@ from calibrate.report.body import body_figure
 from calibrate.report.parts import Verdict
 from emulator.core.errors import InputError
 from emulator.core.store import read_json, replacing
-from emulator.scenes.scene import with_mesh
+from emulator.scenes.scene import Scene
 from emulator.specimens.specimen import Specimen
 from emulator.surrogates import CachedEmulator
 
@@ -83,7 +83,7 @@ def html_of(
     draws = [charts.traces(labels, in_chains, posterior.model.sampled_priors)]
     draws += [charts.pairs(labels, posterior.draws())] if len(labels) > 1 else []
     body: list[tuple[str, list[Markup]]] = []
-    if not isinstance(scene, Specimen):
+    if isinstance(scene, Scene):
         of_body = parts.note(
             "Drag to turn. The slider goes through draws of the posterior, and the mean shape of "
             "each load state; the menu changes the colour; fibres and the mesh are in the legend."
@@ -163,8 +163,10 @@ def _parameters(
 
 
 def _known(posterior: Posterior) -> list[Markup]:
-    words = parts.paragraph(in_words(identify(posterior)), "lines")
-    blocks: list[Markup] = [words, parts.chart(charts.stress(posterior))]
+    blocks: list[Markup] = [parts.paragraph(in_words(identify(posterior)), "lines")]
+    if posterior.model.forward.scene.outside:  # whose law is not known
+        return blocks
+    blocks.append(parts.chart(charts.stress(posterior)))
     if (curve := charts.volume_band(posterior)) is not None:
         blocks.append(parts.chart(curve))
     if volumes := charts.state_volumes(posterior):
@@ -184,9 +186,10 @@ def _known(posterior: Posterior) -> list[Markup]:
 def _sheet(posterior: Posterior) -> list[Markup]:
     """Return the product of moduli and assumed thickness that forces on a sheet determine."""
     model, scene = posterior.model, posterior.model.forward.scene
-    if not any(part.unit == "N" for part in model.observe.parts.values()):
+    forces = any(part.unit == "N" for part in model.observe.parts.values())
+    if not forces or not isinstance(scene, Scene):
         return []
-    thickness, width, _ = np.sort(np.ptp(with_mesh(scene).mesh.nodes, axis=0))
+    thickness, width, _ = np.sort(np.ptp(scene.mesh.nodes, axis=0))
     if thickness > _SHEET * width:
         return []
     draws, moduli = posterior.draws(), (*scene.law.shape_moduli, "prestress")

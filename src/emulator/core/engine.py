@@ -250,6 +250,15 @@ def _work(function: str, task: bytes, objects: Mapping[str, bytes], folder: str 
 
 
 # ---- by words ------------------------------------------------------------------------------------
+def check_engine(words: str) -> tuple[str, str]:
+    """Return the kind of an engine and what it is of; :class:`InputError` for other words."""
+    kind, _, rest = words.partition(":")
+    counted = kind == "processes" and rest.isascii() and rest.isdigit() and int(rest) > 0
+    if words != "threads" and not counted and not (kind == "dask" and rest):
+        raise InputError(f"engine '{words}': give {USAGE}")
+    return kind, rest
+
+
 def engine_of(executor: Executor | str | None) -> Engine | None:
     """Return the engine of an executor or of words; None for threads of this process.
 
@@ -267,23 +276,22 @@ def engine_of(executor: Executor | str | None) -> Engine | None:
 @cache
 def _named(words: str) -> Engine:
     """Return the engine of ``words``, of which this process has one: its workers compiled much."""
-    kind, _, rest = words.partition(":")
-    if kind == "processes" and rest.isascii() and rest.isdigit() and int(rest) > 0:
+    kind, rest = check_engine(words)
+    if kind == "processes":
         # Not by fork: JAX has threads.
         context = multiprocessing.get_context("spawn")
         renewed = lambda: ProcessPoolExecutor(int(rest), mp_context=context)  # noqa: E731
         return Engine(renewed(), int(rest), renewed)
-    if kind == "dask" and rest:
-        try:
-            from distributed import Client
-        except ModuleNotFoundError:
-            raise InputError(f"engine '{words}': install dask and distributed") from None
-        try:
-            client = Client(rest, timeout=10)
-        except (OSError, ValueError) as error:
-            raise InputError(f"engine '{words}': {error}") from None
-        workers = sum(client.ncores().values())
-        if not workers:
-            raise InputError(f"engine '{words}': the cluster has no worker")
-        return Engine(client.get_executor(), workers)
-    raise InputError(f"engine '{words}': give {USAGE}")
+    try:
+        from distributed import Client
+
+        client = Client(rest, timeout=10)
+    except ModuleNotFoundError:
+        raise InputError(f"engine '{words}': install dask and distributed") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"engine '{words}': {error}") from None
+    workers = sum(client.ncores().values())
+    if not workers:
+        raise InputError(f"engine '{words}': the cluster has no worker")
+    # A solve uses one core, and what it compiles is of its process: one at a time in each.
+    return Engine(client.get_executor(), workers)

@@ -34,9 +34,10 @@ class ExternalSimulator:
     def engine(self) -> Engine | None:
         """The engine that does many runs: the executor, or threads that wait for processes."""
         workers = self.scene.solver.at_once
-        if self.executor is None and workers > 1:
+        engine = engine_of(self.executor)
+        if engine is None and workers > 1:
             return Engine(ThreadPoolExecutor(workers), workers)
-        return engine_of(self.executor)
+        return engine
 
     @cached_property
     def _answers(self) -> dict[bytes, Answer]:

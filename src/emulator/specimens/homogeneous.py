@@ -283,8 +283,14 @@ def equilibrium(
     return gradient(end.x - jnp.where(converged, step, 0.0)), converged
 
 
-def homogeneous(scene: Specimen, *, incompressible: bool = False) -> Homogeneous:
-    """Return the states of the specimen ``scene`` as a forward map, see :class:`Homogeneous`."""
+def homogeneous(
+    scene: Specimen, *, incompressible: bool = False, executor: Any = None
+) -> Homogeneous:
+    """Return the states of the specimen ``scene`` as a forward map, see :class:`Homogeneous`.
+
+    executor : as of other solvers, without effect: all states are one program of milliseconds.
+    """
+    del executor
     return Homogeneous(scene, all_nodes(scene), incompressible)
 
 

@@ -33,6 +33,8 @@ def simulate(arguments: Namespace) -> Answer:
     from emulator.scenes.scene import Scene, with_mesh
 
     problem = words.problem_of(arguments)
+    if problem.outside:
+        return _run_outside(problem, words.theta_of(arguments, problem))
     if not isinstance(problem, Scene) and not arguments.out:
         return _simulate_states(problem, words.theta_of(arguments, problem))
     scene = with_mesh(problem)
@@ -68,6 +70,21 @@ def _in_a_line(result: dict[str, Any]) -> str:
 
     status = Status[result["status"].upper()]
     return f"{result['scene']}: {status.text}, {result['iterations']} Newton iterations"
+
+
+def _run_outside(problem: ForwardProblem, theta: jax.Array) -> Answer:
+    """Run another program at one theta, and return its outputs."""
+    import numpy as np
+
+    from calibrate.measurements import kinds_of
+    from calibrate.project.problem import simulator_of
+
+    u = simulator_of(problem)(theta)
+    parts = {name: kind.of(problem) for name, kind in kinds_of(problem).items()}
+    outputs = {n: np.asarray(part(u[part.nodes], theta)).tolist() for n, part in parts.items()}
+    units = {name: "" if part.unit == "1" else f" {part.unit}" for name, part in parts.items()}
+    lines = [f"{name}: {value}{units[name]}" for name, value in outputs.items()]
+    return Answer({"scene": problem.name, "outputs": outputs}, "\n".join(lines))
 
 
 def _simulate_states(problem: ForwardProblem, theta: jax.Array) -> Answer:
@@ -190,6 +207,7 @@ def _add_design(parser: ArgumentParser) -> None:
     words.seed_option("the design"),
     flag("--slopes", "du/dtheta, too"),
     words.load_steps_option(),
+    words.engine_option(),
     option("--out", "STORE.zarr", required=True),
     help="FEM at many theta, into one Zarr store",
     description="Solves a scene at every theta of a design and writes one Zarr store, which "
@@ -209,6 +227,7 @@ def campaign(arguments: Namespace) -> Answer:
         raise InputError(f"--out {out}: the store's name must end in .zarr")
     scene, options = words.scene_of(arguments), NewtonOptions.load_steps(arguments.load_steps)
     plan = words.parameters(question, arguments) | {"scene": scene, "options": options}
+    plan["executor"] = arguments.engine
     solved = fill(question(**plan), out, progress=not arguments.json)
     counts = count_statuses(out)
     samples, seconds = sum(counts.values()), time.perf_counter() - start

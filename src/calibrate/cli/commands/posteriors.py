@@ -91,6 +91,7 @@ def infer(arguments: Namespace) -> Answer:
             posterior,
             folder,
             load_steps=run.load_steps,
+            executor=run.engine,
             deadline=begin + budget,
             progress=progress,
         )
@@ -181,6 +182,7 @@ def _add_solves(parser: ArgumentParser) -> None:
     option("folder", "DIR", "written by calibrate infer"),
     _add_solves,
     words.load_steps_option(default=None),
+    words.engine_option(),
     option("--reweight", "DIR2", "write FEM's posterior, reweighted from the check, there"),
     help="check a posterior against FEM",
 )
@@ -205,6 +207,7 @@ def certify(arguments: Namespace) -> Answer:
         at_most=at_most,
         mesh=0 if arguments.no_mesh else arguments.mesh_runs,
         load_steps=run.load_steps if arguments.load_steps is None else arguments.load_steps,
+        executor=arguments.engine or run.engine,
         reweight_to=arguments.reweight,
         progress=not arguments.json,
     )
