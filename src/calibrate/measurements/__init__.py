@@ -108,7 +108,7 @@ def kinds_of(scene: ForwardProblem) -> Mapping[str, type[Observation]]:
     """Return the kinds of observation of a problem by name: of another program, its outputs."""
     if not scene.outside:
         return OBSERVATIONS
-    (kinds_of_outputs,) = offered("calibrate.measurements.external", "kinds_of_outputs")
+    (kinds_of_outputs,) = offered("calibrate.external.outputs", "kinds_of_outputs")
     kinds: Mapping[str, type[Observation]] = kinds_of_outputs(scene)
     return kinds
 

@@ -34,6 +34,7 @@ from calibrate.state_names import split
 from calibrate.statistical_model.errors import NOT_ASKED, map_errors
 from emulator.core.display import Stages
 from emulator.core.errors import InputError
+from emulator.core.rooms import offered
 from emulator.core.store import write_json
 from emulator.fem import Simulator
 from emulator.scenes.scene import Scene
@@ -141,9 +142,14 @@ def certify_and_keep(
     options : the numbers of FEM runs, and where they are solved, as of
         :func:`calibrate.certificate.examine`, with its errors.
     """
-    stages = Stages(show=progress)
+    stages, scene = Stages(show=progress), posterior.model.forward.scene
+    if scene.usual_map == "rows":
+        (examine_rows,) = offered("calibrate.external.by_rows", "examine_rows")
+        of_rows: Certificate = examine_rows(posterior, Path(folder))
+        write_json(Path(folder) / CERTIFICATE, of_rows.to_json())
+        return of_rows
     with stages("simulator"):
-        simulator = simulator_of(posterior.model.forward.scene, load_steps, executor)
+        simulator = simulator_of(scene, load_steps, executor)
     check = examine(posterior, simulator, stages=stages, progress=progress, **options)
     write_json(Path(folder) / CERTIFICATE, check.certificate.to_json())
     errors = check.certificate.evidence.map_errors

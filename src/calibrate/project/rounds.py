@@ -233,7 +233,12 @@ def by_rounds(problem: Problem) -> Problem:
     # A scene file may have the name of a shipped one, and finer:NAME does.
     if scene.name in shipped() and scene.origin.get("scene") == scene.name:
         return problem
-    return read_problem(replace(run, forward=scene.usual_map), scene=scene)
+    mapped = read_problem(replace(run, forward=scene.usual_map), scene=scene)
+    if scene.usual_map == "rows":
+        (with_emulator_noise,) = offered("calibrate.external.by_rows", "with_emulator_noise")
+        widened: Problem = with_emulator_noise(mapped)
+        return widened
+    return mapped
 
 
 def taught_map(problem: Problem, **options: Any) -> Taught | None:

@@ -11,10 +11,11 @@ from emulator.external.bridge import Bridge
 from emulator.external.command import Command
 from emulator.external.function import Function
 from emulator.external.problem import ExternalProblem, ExternalSolver, Output
+from emulator.external.rows import Rows
 from emulator.scenes.file_schema import ParameterTable
 from emulator.scenes.parameter_space import Parameter
 
-SOLVERS: dict[str, type] = {kind.kind: kind for kind in (Command, Function, Bridge)}
+SOLVERS: dict[str, type] = {kind.kind: kind for kind in (Command, Function, Bridge, Rows)}
 """Ways to ask a solver, by their names in files."""
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self, cast
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from emulator.scenes.scene import all_nodes
 from emulator.surrogates.correction import Correction, correction_at, fit_correction, no_correction
 from emulator.surrogates.protocol import (
     Arrays,
+    ForwardMap,
     Prediction,
     fingerprint_of,
     inside_only,
@@ -29,17 +31,43 @@ _ALL, _DATA = "outputs", "data"  # prefixes of arrays
 
 
 @dataclass(frozen=True, eq=False)
-class TaughtOutputs:
-    """The outputs of a solver that rounds of its runs have taught.
+class OutputsMap:
+    """The outputs of a solver as a forward map.
 
     scene : the problem. nodes : the rows (k,) of the outputs that are returned.
+    """
+
+    scene: ExternalProblem
+    nodes: np.ndarray
+
+    @abstractmethod
+    def numbers(self, x: jax.Array) -> jax.Array:
+        """Return all outputs (n,) at a position (p,) in the box."""
+
+    def __call__(self, theta: jax.Array) -> jax.Array:
+        """Return the outputs (k, 3) in the first column, at ``theta`` (p,)."""
+        numbers = self.numbers(self.scene.to_unit(theta))
+        return jnp.zeros((len(self.nodes), 3)).at[:, 0].set(numbers[self.nodes])
+
+    def evaluate(self, theta: jax.Array) -> Prediction:
+        """Return the outputs, and whether theta is inside the box."""
+        return inside_only(cast(ForwardMap, self), theta)
+
+    def at(self, nodes: np.ndarray) -> Self:
+        """Return the map of some of its rows."""
+        rows = self.nodes[rows_of(cast(ForwardMap, self), nodes)]
+        return replace(self, nodes=rows)
+
+
+@dataclass(frozen=True, eq=False)
+class TaughtOutputs(OutputsMap):
+    """The outputs of a solver that rounds of its runs have taught.
+
     outputs : the process of all outputs, of positions in the box.
     data : the process of the data of the posterior for which the runs were made.
     record : what is told of the rounds.
     """
 
-    scene: ExternalProblem
-    nodes: np.ndarray
     outputs: DataProcess
     data: DataProcess
     record: Mapping[str, Any]
@@ -53,19 +81,9 @@ class TaughtOutputs:
         arrays = [*self.outputs.arrays().values(), *self.data.arrays().values()]
         return fingerprint_of(self.kind, self.scene.fingerprint, self.nodes, *arrays)
 
-    def __call__(self, theta: jax.Array) -> jax.Array:
-        """Return the outputs (k, 3) in the first column, at ``theta`` (p,)."""
-        x = self.scene.to_unit(theta)
-        numbers = self.outputs.constant + correction_at(self.outputs.correction, x)
-        return jnp.zeros((len(self.nodes), 3)).at[:, 0].set(numbers[self.nodes])
-
-    def evaluate(self, theta: jax.Array) -> Prediction:
-        """Return the outputs, and whether theta is inside the box."""
-        return inside_only(self, theta)
-
-    def at(self, nodes: np.ndarray) -> TaughtOutputs:
-        """Return the map of some of its rows."""
-        return replace(self, nodes=self.nodes[rows_of(self, nodes)])
+    def numbers(self, x: jax.Array) -> jax.Array:
+        """Return all outputs (n,) at a position (p,) in the box."""
+        return self.outputs.constant + correction_at(self.outputs.correction, x)
 
     def data_of(self, question: str) -> DataProcess | None:
         """Return the process of the data that ``question`` asks for; None where it is another."""

@@ -30,6 +30,7 @@ FORWARD_MAPS: dict[str, ForwardKind] = {
         FEM,
         *offered("emulator.specimens.homogeneous", "HOMOGENEOUS"),
         *offered("emulator.specimens.homogeneous", "INCOMPRESSIBLE"),
+        *offered("emulator.external.rows", "ROWS"),
     )
 }
 

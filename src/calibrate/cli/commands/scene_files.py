@@ -44,6 +44,14 @@ _FAR = 0.15  # of the body's length
         "of a table of a tube: inner radius of the sector that it opens to, thickness of each "
         "layer from the inside, mm",
     ),
+    option(
+        "--inputs",
+        "COLUMN",
+        "of a table of a solver's runs: the columns of its parameters, or the number of the first "
+        "columns that are; the others are outputs",
+        nargs="+",
+        default=[],
+    ),
     help="first files for your mesh, or for the table of a test",
     description="Reads a mesh (gmsh, VTU and whatever meshio reads), says which sets it has, "
     "guesses from their names and from its size, says so, and writes a commented scene file. Of a "
@@ -59,6 +67,8 @@ def init(arguments: Namespace) -> Answer:
     out = Path(arguments.out or source.parent / f"{source.stem or 'scene'}.toml")
     is_table = source.suffix.lower() in (*TEXT, *SPREADSHEETS, *OTHER_SPREADSHEETS)
     draft = _init_specimen if is_table else _init_scene
+    if arguments.inputs:
+        return _init_runs(source, out, arguments)
     if len(laws) < 2:
         return draft(source, out, laws[0] if laws else None, arguments)
     answers, reasons = dict[str, Answer](), dict[str, str]()
@@ -79,6 +89,25 @@ def init(arguments: Namespace) -> Answer:
         *(f"law {law} is left out: {reason}" for law, reason in reasons.items()),
         f"look for CHANGE in the scenes, then: calibrate infer {' '.join(files)} --out RUNS",
     ]
+    return Answer(result, "\n".join(lines))
+
+
+def _init_runs(table: Path, out: Path, arguments: Namespace) -> Answer:
+    """Write the file of a table of runs, and list its parameters and outputs."""
+    from calibrate.external.draft import draft_of_table
+
+    for name in ("unit", "law", "tube"):
+        if getattr(arguments, name):
+            raise InputError(f"--{name} has no effect beside --inputs")
+    draft = draft_of_table(table, out, arguments.inputs)
+    lines = [
+        f"parameters: {', '.join(draft.parameters)}",
+        f"outputs: {', '.join(draft.outputs)}",
+        *draft.notes,
+        f"written to {draft.path}; then: calibrate infer {draft.path} --data DATA.csv --noise "
+        f"{draft.outputs[0]}=SD --out RUN",
+    ]
+    result = draft._asdict() | {"path": str(draft.path)}
     return Answer(result, "\n".join(lines))
 
 

@@ -1,0 +1,1 @@
+"""Calibration of external problems: their outputs as data, tables of runs, and their first files."""

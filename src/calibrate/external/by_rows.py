@@ -1,0 +1,189 @@
+r"""What a table of runs says of a posterior, without a solver that could make more.
+
+The posterior has the emulator's error in its noise: where data have independent Gaussian noise of
+sd :math:`\sigma`, the model takes :math:`\sqrt{\sigma^2 + s^2}`, with :math:`s` the size of errors at
+rows that are left out (their 90 % quantile over a Gaussian's).
+
+The verdict asks what a certificate asks, by how much the true solver would move the posterior, of
+what the rows leave open: error functions :math:`e_s` of the emulator are drawn from its process
+given all rows, jointly at draws of the posterior, which get the weights
+
+.. math:: w_s \propto \exp[\log L(\hat y + e_s) - \log L(\hat y)] ,
+
+and the root mean square over s of the moves of a mean is compared with the limit of any certificate.
+It rests on the process, whose sds were widened by what they missed at rows kept apart
+(:mod:`emulator.external.rows`), and not on runs at the posterior: there are none.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibrate.certificate.estimates import misfits, sampling_of
+from calibrate.certificate.evidence import Changes, Evidence, Figure, MeshChange, Physics, Tail
+from calibrate.certificate.verdict import Certificate, judge
+from calibrate.importance.proposals import key_from
+from calibrate.importance.weights import effective, normalised
+from calibrate.posterior import Posterior
+from calibrate.project.problem import Problem
+from calibrate.statistical_model.predictive import Predictive
+from emulator.core.errors import InputError
+from emulator.external.rows import RowsMap, process_in
+from emulator.surrogates.correction import no_correction
+from emulator.surrogates.discrepancy import maximin_subset
+
+NEXT = "next_runs.csv"
+"""The file of the runs that would say most, in the folder of a posterior."""
+_DRAWS, _FUNCTIONS = 400, 256  # of the posterior, and of the emulator's error
+_NEXT, _CANDIDATES = 8, 4  # runs to make next, each of so many draws
+_NORMAL_90 = 1.6449
+
+
+def with_emulator_noise(problem: Problem) -> Problem:
+    """Return the problem of a table with the emulator's error in the noise of each observation."""
+    process, scene = process_in(problem.scene), problem.scene
+    errors = np.quantile(np.abs(process.left_out), 0.9, axis=0) / _NORMAL_90
+    noises = problem.run.noise
+    assert isinstance(noises, Mapping)
+    widened = dict(noises)
+    for name, sd in noises.items():
+        part = next(p for n, p in problem.observe.parts.items() if n.partition("@")[0] == name
+                    or n == name)  # fmt: skip
+        if isinstance(sd, int | float):
+            widened[name] = float(np.hypot(sd, np.sqrt(np.mean(errors[part.nodes] ** 2))))
+    return replace(problem, run=replace(problem.run, noise=widened), scene=scene)
+
+
+class _Moves(NamedTuple):
+    """Moves of means in sd (f, p) and of log sds (f, p) by f error functions, and effective draws."""
+
+    means: np.ndarray
+    log_sds: np.ndarray
+    effective: np.ndarray
+
+
+def examine_rows(posterior: Posterior, folder: Path | None = None, seed: int = 0) -> Certificate:
+    """Return the certificate that a table of runs allows.
+
+    folder : where :data:`NEXT` is written, if anywhere.
+
+    :class:`InputError` for a posterior of another forward map.
+    """
+    model, full = posterior.model, posterior.model.full
+    if not isinstance(full, RowsMap):
+        raise InputError("this posterior is not of a table's rows")
+    rng = np.random.default_rng(seed)
+    every = posterior.draws()
+    count = len(next(iter(every.values())))
+    rows = rng.choice(count, size=min(_DRAWS, count), replace=False)
+    draws = {name: values[rows] for name, values in every.items()}
+    thetas = np.stack([np.asarray(model.states.thetas(_one(draws, k))) for k in range(len(rows))])
+    moves, sds = _moves(posterior, full, draws, thetas, rng)
+    names = model.names
+    shift = {n: _figure(moves.means[:, k]) for k, n in enumerate(names)}
+    log_sd = {n: _figure(moves.log_sds[:, k]) for k, n in enumerate(names)}
+    changes = Changes(shift, log_sd)
+    predictive = Predictive(model, posterior.data, every)
+    none = no_correction(1, len(model.states.unknowns), len(predictive.scales))
+    z = predictive.unconstrain(draws)
+    evidence = Evidence(
+        changes,
+        changes,
+        {},
+        {},
+        sampling_of(posterior),
+        Physics(0, 0, 0.0, np.nan, 0, 0),
+        Tail(np.nan, np.nan, float(moves.effective.mean()), 1.0, 0.0, np.inf, 0),
+        misfits(predictive, none, z, key_from(rng)),
+        mesh=MeshChange(why="its mesh is another program's, which only that one can refine"),
+        box=tuple(posterior.box_ends()),
+        noise=tuple(posterior.inferred_noise()),
+        forward=full.kind,
+    )
+    certificate = judge(evidence)
+    findings = [*certificate.findings, _basis(full)]
+    if folder is not None:
+        _write_next(posterior, full, thetas, sds, folder / NEXT)
+        findings.append(f"the runs that would say most are in {folder / NEXT}")
+    return replace(certificate, findings=tuple(findings))
+
+
+def _one(draws: Mapping[str, np.ndarray], k: int) -> dict[str, float]:
+    return {name: float(values[k]) for name, values in draws.items()}
+
+
+def _basis(full: RowsMap) -> str:
+    process = full.process
+    return (
+        f"by {len(process.at)} rows, no run was made: it holds if the solver is as smooth where the "
+        "posterior is as at rows that were left out"
+    )
+
+
+def _figure(moves: np.ndarray) -> Figure:
+    """Return the root mean square of moves (f,), which so many functions tell to a few per cent."""
+    return Figure(float(np.sqrt(np.mean(moves**2))), 0.0)
+
+
+def _moves(
+    posterior: Posterior,
+    full: RowsMap,
+    draws: Mapping[str, np.ndarray],
+    thetas: np.ndarray,
+    rng: np.random.Generator,
+) -> tuple[_Moves, np.ndarray]:
+    """Return moves by error functions drawn at ``thetas`` (s, S, p), and sds (s, S, n) there."""
+    model, data = posterior.model, posterior.data
+    nodes = model.observe.nodes
+    points = thetas.reshape(-1, thetas.shape[-1])
+    errors, sds = full.drawn_errors(points, nodes, _FUNCTIONS, rng)  # (f, a, k), (a, k)
+    errors = errors.reshape(len(errors), *thetas.shape[:2], -1)
+    u = np.zeros((*thetas.shape[:2], len(nodes), 3))
+    predicted = jax.jit(jax.vmap(full.at(nodes)))(jnp.asarray(points))
+    u[...] = np.asarray(predicted).reshape(u.shape)
+
+    @jax.jit
+    def likelihood(u: jax.Array, thetas: jax.Array, draw: Any, added: jax.Array) -> jax.Array:
+        means = model.observe(u.at[..., 0].add(added), thetas)
+        return model.log_likelihood(draw, means, data)
+
+    of_draws = jax.jit(jax.vmap(likelihood))
+    stacked = {name: jnp.asarray(values) for name, values in draws.items()}
+    base = of_draws(u, thetas, stacked, jnp.zeros(u.shape[:-1]))
+    x = np.stack([draws[name] for name in model.names], axis=1)
+    mean, sd = x.mean(axis=0), x.std(axis=0)
+    sd = np.where(sd > 0.0, sd, 1.0)
+    means, logs, sizes = [], [], []
+    for error in errors:
+        with np.errstate(over="ignore"):
+            weights = normalised(np.asarray(of_draws(u, thetas, stacked, jnp.asarray(error)) - base))
+        moved = weights @ x
+        spread = np.sqrt(np.maximum(weights @ (x - moved) ** 2, 1e-300))
+        means.append((moved - mean) / sd)
+        logs.append(np.log(spread / sd))
+        sizes.append(effective(weights))
+    return _Moves(np.stack(means), np.stack(logs), np.array(sizes)), sds.reshape(*thetas.shape[:2], -1)
+
+
+def _write_next(
+    posterior: Posterior, full: RowsMap, thetas: np.ndarray, sds: np.ndarray, path: Path
+) -> None:
+    """Write theta at which a run would say most: where the sd over the noise is large, far apart."""
+    scene = full.scene
+    doubt = (sds / sds.mean(axis=(0, 1))).mean(axis=2)  # (s, S)
+    points, doubt = thetas.reshape(-1, thetas.shape[-1]), doubt.ravel()
+    most = np.argsort(-doubt)[: max(len(doubt) // _CANDIDATES, _NEXT)]
+    positions = np.asarray(scene.to_unit(jnp.asarray(points[most])))
+    rows = most[maximin_subset(positions, min(_NEXT, len(most)))]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(scene.parameter_names)
+        writer.writerows([[f"{value:.8g}" for value in points[row]] for row in rows])

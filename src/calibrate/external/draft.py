@@ -1,0 +1,120 @@
+"""First files of an external problem, from a table of runs."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from emulator.core.cells import Cells, read_cells
+from emulator.core.errors import InputError
+from emulator.core.units import with_unit
+
+_LOG = 10.0  # ratio of the ends of a range from which its scale is logarithmic
+
+
+class Draft(NamedTuple):
+    """What was written: the file, the names of parameters and outputs, and notes on both."""
+
+    path: Path
+    parameters: list[str]
+    outputs: list[str]
+    notes: list[str]
+
+
+def draft_of_table(table: Path, out: Path, inputs: Sequence[str]) -> Draft:
+    """Write the file of a problem that is a table of runs.
+
+    Parameters
+    ----------
+    table : the table; a row a run.
+    out : the file to write.
+    inputs : the columns of parameters, or the number of the first columns that are; all other
+        columns of numbers are outputs.
+
+    Raises
+    ------
+    InputError
+        No such column, no output, or the file is there already.
+    """
+    if out.exists():
+        raise InputError(f"{out} is there already; give another name with --out")
+    cells = read_cells(table)
+    chosen = _chosen(cells, inputs)
+    notes, parameters, outputs, columns = list[str](), list[str](), list[str](), dict[str, str]()
+    blocks = []
+    for word in chosen:
+        values = _numbers(cells, word)
+        name = _named(word, columns)
+        low, high = float(values.min()), float(values.max())
+        if low == high:
+            notes.append(f"'{word}' is {low:g} in all rows: left out")
+            del columns[name]
+            continue
+        scale = 'scale = "log"\n' if low > 0.0 and high > _LOG * low else ""
+        blocks.append(
+            f"[parameters.{name}]\n{_unit_of(word)}range = [{low:.10g}, {high:.10g}]"
+            f"  # of the rows: the map answers nowhere else\n{scale}"
+        )
+        parameters.append(name)
+    for word in (w for w in cells.words if w not in chosen):
+        try:
+            values = _numbers(cells, word, gaps=True)
+        except InputError:
+            notes.append(f"'{word}' has text: left out")
+            continue
+        name = _named(word, columns)
+        if not np.isfinite(values).any():
+            notes.append(f"'{word}' is empty: left out")
+            del columns[name]
+            continue
+        blocks.append(f"[outputs.{name}]\n{_unit_of(word)}")
+        outputs.append(name)
+    if not parameters or not outputs:
+        raise InputError(f"{table}: no {'outputs' if parameters else 'parameters'}; see --inputs")
+    renamed = {name: word for name, word in columns.items() if name != word}
+    notes += [f"column '{word}' is called {name}" for name, word in list(renamed.items())[:5]]
+    entries = ", ".join(f"{name} = {json.dumps(word)}" for name, word in renamed.items())
+    head = (
+        "# A table of runs as a problem: calibrate infer FILE --data DATA.csv --noise OUTPUT=SD\n"
+        f'[solver]\nkind = "table"\nfile = {json.dumps(table.name)}\n'
+    )
+    head += f"columns = {{ {entries} }}\n" if renamed else ""
+    out.write_text("\n".join([head, *blocks]), encoding="utf-8")
+    return Draft(out, parameters, outputs, notes)
+
+
+def _chosen(cells: Cells, inputs: Sequence[str]) -> list[str]:
+    if len(inputs) == 1 and inputs[0].isdigit() and inputs[0] not in cells.words:
+        count = int(inputs[0])
+        if not 0 < count < len(cells.words):
+            raise InputError(f"--inputs {count}: {cells.path} has {len(cells.words)} columns")
+        return list(cells.words[:count])
+    for word in inputs:
+        if word not in cells.words:
+            raise InputError(f"--inputs: {cells.path} has no column '{word}'")
+    return list(inputs)
+
+
+def _numbers(cells: Cells, word: str, *, gaps: bool = False) -> np.ndarray:
+    return np.array([cells.number(k, word, gaps=gaps) for k in cells.rows])
+
+
+def _named(word: str, columns: dict[str, str]) -> str:
+    """Return a name for a column, of letters, digits and _, that no other has; and keep it."""
+    name = re.sub(r"\W+", "_", with_unit(word)[0]).strip("_") or "column"
+    name = f"_{name}" if name[0].isdigit() else name
+    known, number = name, 2
+    while name in columns:
+        name, number = f"{known}_{number}", number + 1
+    columns[name] = word
+    return name
+
+
+def _unit_of(word: str) -> str:
+    unit = with_unit(word)[1]
+    return f"unit = {json.dumps(unit)}\n" if unit else ""
