@@ -31,6 +31,7 @@ COMMANDS = {
     "campaign": "fem",
     "certify": "posteriors",
     "check": "check",
+    "cohort": "cohort",
     "compare": "posteriors",
     "completion": "scene_files",
     "demo": "posteriors",

@@ -1,1 +1,1 @@
-"""Calibration of external problems: their outputs as data, tables of runs, and their first files."""
+"""Calibration of external problems: outputs as data, tables of runs, and first files."""

@@ -1,8 +1,8 @@
 r"""What a table of runs says of a posterior, without a solver that could make more.
 
 The posterior has the emulator's error in its noise: where data have independent Gaussian noise of
-sd :math:`\sigma`, the model takes :math:`\sqrt{\sigma^2 + s^2}`, with :math:`s` the size of errors at
-rows that are left out (their 90 % quantile over a Gaussian's).
+sd :math:`\sigma`, the model takes :math:`\sqrt{\sigma^2 + s^2}`, with :math:`s` the size of errors
+at rows that are left out (their 90 % quantile over a Gaussian's).
 
 The verdict asks what a certificate asks, by how much the true solver would move the posterior, of
 what the rows leave open: error functions :math:`e_s` of the emulator are drawn from its process
@@ -10,7 +10,7 @@ given all rows, jointly at draws of the posterior, which get the weights
 
 .. math:: w_s \propto \exp[\log L(\hat y + e_s) - \log L(\hat y)] ,
 
-and the root mean square over s of the moves of a mean is compared with the limit of any certificate.
+and the root mean square over s of the moves of a mean is compared with the limit of a certificate.
 It rests on the process, whose sds were widened by what they missed at rows kept apart
 (:mod:`emulator.external.rows`), and not on runs at the posterior: there are none.
 """
@@ -63,7 +63,7 @@ def with_emulator_noise(problem: Problem) -> Problem:
 
 
 class _Moves(NamedTuple):
-    """Moves of means in sd (f, p) and of log sds (f, p) by f error functions, and effective draws."""
+    """Moves of means in sd (f, p) and of log sds (f, p) by f functions, and effective draws."""
 
     means: np.ndarray
     log_sds: np.ndarray
@@ -111,7 +111,7 @@ def examine_rows(posterior: Posterior, folder: Path | None = None, seed: int = 0
     certificate = judge(evidence)
     findings = [*certificate.findings, _basis(full)]
     if folder is not None:
-        _write_next(posterior, full, thetas, sds, folder / NEXT)
+        _write_next(full, thetas, sds, folder / NEXT)
         findings.append(f"the runs that would say most are in {folder / NEXT}")
     return replace(certificate, findings=tuple(findings))
 
@@ -123,8 +123,8 @@ def _one(draws: Mapping[str, np.ndarray], k: int) -> dict[str, float]:
 def _basis(full: RowsMap) -> str:
     process = full.process
     return (
-        f"by {len(process.at)} rows, no run was made: it holds if the solver is as smooth where the "
-        "posterior is as at rows that were left out"
+        f"by {len(process.at)} rows, no run was made: it holds if the solver is as smooth where "
+        "the posterior is as at rows that were left out"
     )
 
 
@@ -164,19 +164,21 @@ def _moves(
     means, logs, sizes = [], [], []
     for error in errors:
         with np.errstate(over="ignore"):
-            weights = normalised(np.asarray(of_draws(u, thetas, stacked, jnp.asarray(error)) - base))
+            weights = normalised(
+                np.asarray(of_draws(u, thetas, stacked, jnp.asarray(error)) - base)
+            )
         moved = weights @ x
         spread = np.sqrt(np.maximum(weights @ (x - moved) ** 2, 1e-300))
         means.append((moved - mean) / sd)
         logs.append(np.log(spread / sd))
         sizes.append(effective(weights))
-    return _Moves(np.stack(means), np.stack(logs), np.array(sizes)), sds.reshape(*thetas.shape[:2], -1)
+    return _Moves(np.stack(means), np.stack(logs), np.array(sizes)), sds.reshape(
+        *thetas.shape[:2], -1
+    )
 
 
-def _write_next(
-    posterior: Posterior, full: RowsMap, thetas: np.ndarray, sds: np.ndarray, path: Path
-) -> None:
-    """Write theta at which a run would say most: where the sd over the noise is large, far apart."""
+def _write_next(full: RowsMap, thetas: np.ndarray, sds: np.ndarray, path: Path) -> None:
+    """Write theta at which a run would say most: where errors are large, and far apart."""
     scene = full.scene
     doubt = (sds / sds.mean(axis=(0, 1))).mean(axis=2)  # (s, S)
     points, doubt = thetas.reshape(-1, thetas.shape[-1]), doubt.ravel()

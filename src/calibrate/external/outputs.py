@@ -61,5 +61,3 @@ def kinds_of_outputs(scene: ExternalProblem) -> dict[str, type[Observation]]:
         )
         for output in scene.outputs
     }
-
-

@@ -155,7 +155,6 @@ def observations_from_json(
     scene: ForwardProblem, description: Mapping[str, Mapping[str, Any]]
 ) -> Observations:
     """Return the observations that :meth:`Observations.to_json` described."""
-
     kinds = kinds_of(scene)
 
     @cache

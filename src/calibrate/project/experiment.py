@@ -127,7 +127,8 @@ def read_experiment(path: str | Path, entries: Mapping[str, Any] = {}) -> Proble
     where = f"{file_name}, [population]"
     shared = schema.read_as(Shared, file.get(POPULATION, {}), where, population_lines, toml=True)
     with naming(file_name):
-        return Members({name: member.run for name, member in problems.items()}, shared, problems)
+        runs = {name: member.run for name, member in problems.items()}
+        return Members(runs, shared, problems=problems)
 
 
 def _without(table: Mapping[str, Any], entries: Mapping[str, Any]) -> dict[str, Any]:

@@ -7,12 +7,15 @@ hierarchy of them all (:func:`calibrate.population.read_hierarchy`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterable, Mapping
+from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tqdm import tqdm
 
 from calibrate.figures import shrinkage
 from calibrate.population import Hierarchy, population_model, read_hierarchy, sample_population
@@ -35,15 +38,21 @@ from calibrate.project.results import (
     reserved,
     run_of,
 )
+from calibrate.project.rounds import by_rounds
 from calibrate.project.run import Run
 from calibrate.samplers.auto import AUTO
 from calibrate.samplers.nuts import NUTS
 from calibrate.statistical_model import Model
 from emulator.core import schema
-from emulator.core.errors import InputError
+from emulator.core.engine import engine_of
+from emulator.core.errors import InputError, SolverError
 from emulator.core.store import read_json, write_json
 
 SHRINKAGE = "shrinkage.png"
+GROUPS, FAILED = (
+    "groups",
+    "failed",
+)  # entries of a population's run.json; the latter begins verdicts
 _SAME_MODEL = (
     "scene_fingerprint", "forward_fingerprint", "forward_error", "observe", "noise", "prior",
     "prior_dependence", "load_states",
@@ -78,11 +87,15 @@ class Members:
 
     members : the run of each by itself, by name.
     population : what they share.
+    groups : the group of each member, by name, of members that have one.
+    unread : why further members could not be read, by name.
     problems : the members' problems, where their scenes and data have been read.
     """
 
     members: Mapping[str, Run]
     population: Shared = Shared()
+    groups: Mapping[str, str] = field(default_factory=dict)
+    unread: Mapping[str, str] = field(default_factory=dict)
     problems: Mapping[str, Problem] = field(default_factory=dict, compare=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -96,7 +109,12 @@ class Members:
 
     def problem(self, name: str) -> Problem:
         """Return the problem of one member."""
-        return self.problems[name] if name in self.problems else read_problem(self.members[name])
+        known = self.problems.get(name)
+        return by_rounds(read_problem(self.members[name]) if known is None else known)
+
+    def only(self, names: Iterable[str]) -> Members:
+        """Return some of the members."""
+        return replace(self, members={name: self.members[name] for name in names})
 
 
 def infer_members(
@@ -105,6 +123,8 @@ def infer_members(
     *,
     certify: bool = True,
     force: bool = False,
+    tolerant: bool = False,
+    executor: Executor | str | None = None,
     progress: bool = False,
 ) -> tuple[Hierarchy, dict[str, str]]:
     """Calibrate all members, write everything to ``folder``, and return verdicts by member.
@@ -117,31 +137,40 @@ def infer_members(
     plan : the members and what they share.
     certify : check each member's posterior against FEM.
     force : replace the results of an earlier calibration.
+    tolerant : leave members out that fail, each with a verdict that says why; the others make the
+        population.
+    executor : the executor of :mod:`concurrent.futures`, or the words of an engine, by which
+        members are calibrated at the same time (:mod:`emulator.core.engine`); by default one is
+        after the other, and each has all cores.
 
     Raises
     ------
     InputError
-        ``folder`` has the results of an earlier run and there is no ``force``, or a member's data
-        or model does not fit.
+        ``folder`` has the results of an earlier run and there is no ``force``, a member's data
+        or model does not fit, or fewer than two members are left.
     """
     folder = Path(folder)
     with reserved(folder, (POSTERIOR,), force=force):
         for name in (REPORT, POSTERIOR):
             (folder / name).unlink(missing_ok=True)
-        runs = {name: asdict(run) for name, run in plan.members.items()}
-        write_json(folder / RUN, {MEMBERS: runs, POPULATION: asdict(plan.population)})
-        posteriors: dict[str, Posterior] = {}
-        verdicts: dict[str, str] = {}
-        for name, run in plan.members.items():
-            at = folder / MEMBERS / name
-            posteriors[name] = _posterior_of(plan.problem(name), at, force, progress)
-            if certify:
-                verdicts[name] = (
-                    _written_verdict(at)
-                    or certify_and_keep(
-                        posteriors[name], at, load_steps=run.load_steps, progress=progress
-                    ).verdict
-                )
+        _write_plan(folder, plan)
+        posteriors = dict[str, Posterior]()
+        verdicts = {name: f"{FAILED}: {why}" for name, why in plan.unread.items()}
+        calibrate = _Calibration(plan, folder, certify, force, tolerant, progress=progress)
+        engine, names = engine_of(executor), iter(plan.members)
+        if engine is not None:  # whose workers each have a process, and so all of a run's threads
+            calibrate = replace(calibrate, progress=False, here=False)
+        done = map(calibrate, names) if engine is None else engine.in_order(calibrate, names)
+        for name, (posterior, verdict) in zip(plan.members, done, strict=True):
+            if verdict is not None:
+                verdicts[name] = verdict
+            if verdict is None or not verdict.startswith(FAILED):
+                at = folder / MEMBERS / name
+                posteriors[name] = read_posterior(at)[1] if posterior is None else posterior
+            if engine is not None and progress:
+                tqdm.write(f"{name}: {verdict or 'done'}", file=sys.stderr)
+        plan = _of_members_left(plan, posteriors, verdicts)
+        _write_plan(folder, plan, {n: v for n, v in verdicts.items() if n not in posteriors})
         hierarchy = _sample_together(plan, posteriors, folder / SAMPLING, progress=progress)
         shrinkage.draw(hierarchy, folder / SHRINKAGE)
         hierarchy.save(folder / POSTERIOR)
@@ -164,7 +193,7 @@ def read_members(folder: str | Path) -> tuple[Members, Hierarchy]:
         name: run_of(run, f"{where}, member '{name}'") for name, run in entries[MEMBERS].items()
     }
     shared = schema.read_as(Shared, entries.get(POPULATION, {}), f"{where}, {POPULATION}")
-    plan, path = Members(runs, shared), folder / POSTERIOR
+    plan, path = Members(runs, shared, entries.get(GROUPS, {})), folder / POSTERIOR
     if not path.exists():
         sampled = sum((folder / MEMBERS / name / POSTERIOR).exists() for name in runs)
         raise InputError(
@@ -187,6 +216,64 @@ def verdicts_in(plan: Members, folder: str | Path) -> dict[str, str]:
         for name in plan.members
         if (verdict := _written_verdict(Path(folder) / MEMBERS / name)) is not None
     }
+
+
+def failures_in(folder: str | Path) -> dict[str, str]:
+    """Return why members of the population in ``folder`` failed, by name."""
+    return dict(read_json(Path(folder) / RUN).get(FAILED, {}))
+
+
+def _write_plan(folder: Path, plan: Members, failed: Mapping[str, str] = {}) -> None:
+    entries: dict[str, Any] = {MEMBERS: {name: asdict(run) for name, run in plan.members.items()}}
+    entries[POPULATION] = asdict(plan.population)
+    if plan.groups:
+        entries[GROUPS] = dict(plan.groups)
+    if failed:
+        entries[FAILED] = dict(failed)
+    write_json(folder / RUN, entries)
+
+
+def _of_members_left(
+    plan: Members, posteriors: Mapping[str, Posterior], verdicts: Mapping[str, str]
+) -> Members:
+    """Return the members that have a posterior; :class:`InputError` for fewer than two."""
+    if len(posteriors) < 2:
+        faults = [f"{name} {verdicts[name]}" for name in plan.members if name not in posteriors]
+        raise InputError(f"members: {len(posteriors)} of {len(plan.members)} is left; {faults[0]}")
+    return plan.only(posteriors)
+
+
+@dataclass(frozen=True)
+class _Calibration:
+    """Calibrates one member, in this process or in a worker's.
+
+    folder : the population's. here : whether the posterior is returned, or only written.
+    """
+
+    plan: Members
+    folder: Path
+    certify: bool
+    force: bool
+    tolerant: bool
+    progress: bool
+    here: bool = True
+
+    def __call__(self, name: str) -> tuple[Posterior | None, str | None]:
+        """Return the posterior and its verdict; of a member that failed neither, and why."""
+        at, run = self.folder / MEMBERS / name, self.plan.members[name]
+        try:
+            posterior = _posterior_of(self.plan.problem(name), at, self.force, self.progress)
+            verdict = _written_verdict(at)
+            if self.certify and verdict is None:
+                verdict = certify_and_keep(
+                    posterior, at, load_steps=run.load_steps, executor=run.engine,
+                    progress=self.progress,
+                ).verdict  # fmt: skip
+        except (InputError, SolverError) as error:
+            if not self.tolerant:
+                raise
+            return None, f"{FAILED}: {error}"
+        return posterior if self.here else None, verdict if self.certify else None
 
 
 def _posterior_of(problem: Problem, folder: Path, force: bool, progress: bool) -> Posterior:
@@ -245,6 +332,7 @@ def members_report(hierarchy: Hierarchy, verdicts: Mapping[str, str]) -> dict[st
     shrinkages = hierarchy.shrinkage()
     return {
         "population": hierarchy.summary(),
+        "failed": {name: v for name, v in verdicts.items() if name not in hierarchy.members},
         "members": {
             member: {
                 "verdict": verdicts.get(member, NOT_CERTIFIED),

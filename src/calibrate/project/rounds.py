@@ -225,7 +225,8 @@ def before_runs(model: Model, scene: ForwardProblem) -> tuple[Model, DataProcess
 def by_rounds(problem: Problem) -> Problem:
     """Return the problem with a map that is taught where its scene has no emulator.
 
-    A specimen gets its states, a table of runs its rows. A run that names a forward map or an emulator is returned as it is.
+    A specimen gets its states, a table of runs its rows. A run that names a forward map or an
+    emulator is returned as it is.
     """
     run, scene = problem.run, problem.scene
     if run.forward != EMULATOR.name or run.emulator is not None:

@@ -236,7 +236,8 @@ class _Unpickler(pickle.Unpickler):
 def _work(function: str, task: bytes, objects: Mapping[str, bytes], folder: str | None) -> Any:
     """Return the function's result for one task, or which objects it lacks.
 
-    function : its digest. folder : the folder of compiled programs that JAX shares with the process that asks.
+    function : its digest.
+    folder : the folder of compiled programs, shared with the process that asks.
     """
     if folder is not None and jax.config.jax_compilation_cache_dir != folder:
         jax.config.update("jax_compilation_cache_dir", folder)

@@ -7,6 +7,7 @@ import urllib.error
 import urllib.request
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -46,11 +47,11 @@ class Bridge:
         url = f"{self.url.rstrip('/')}/{what}"
         if not url.startswith(("http://", "https://")):
             raise InputError(f"url = '{self.url}'; give one like http://localhost:4242")
-        post = urllib.request.Request(  # noqa: S310 - http, see above
+        post = urllib.request.Request(
             url, json.dumps(content).encode(), {"Content-Type": "application/json"}
         )
         try:
-            with urllib.request.urlopen(post, timeout=self.time_limit) as answer:  # noqa: S310
+            with urllib.request.urlopen(post, timeout=self.time_limit) as answer:
                 told = json.loads(answer.read())
         except urllib.error.HTTPError as error:
             fault = _error_in(error.read())
@@ -88,8 +89,10 @@ class Bridge:
                     f"'{problem.name}' has {here}"
                 )
         ends = np.cumsum([0, *inputs])
-        parts = [values[a:b] for a, b in zip(ends, ends[1:], strict=False)]
-        flat = np.concatenate([np.ravel(part) for part in self._ask("Evaluate", input=parts)["output"]])
+        parts = [values[a:b] for a, b in pairwise(ends)]
+        flat = np.concatenate(
+            [np.ravel(part) for part in self._ask("Evaluate", input=parts)["output"]]
+        )
         answer = problem.answer({name: flat[rows] for name, rows in problem.places.items()})
         if "Gradient" not in supported and "ApplyJacobian" not in supported:
             return answer
@@ -115,7 +118,9 @@ class Bridge:
                     sens = [self._ask("Gradient", sens=e, **at)["output"] for e in _units(size)]
                     rows[place, columns] = np.array(sens)
                 else:
-                    along = [self._ask("ApplyJacobian", vec=e, **at)["output"] for e in _units(width)]
+                    along = [
+                        self._ask("ApplyJacobian", vec=e, **at)["output"] for e in _units(width)
+                    ]
                     rows[place, columns] = np.array(along).T
         return rows[:, :parameters]
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
+from pydantic import Field
+
 from emulator.core.errors import InputError
 from emulator.core.schema import OneOf, Source, Table, parse
 from emulator.external.bridge import Bridge
@@ -49,7 +51,7 @@ class ProblemFile(Table):
     """what varies, with a range or a log-normal prior."""
     outputs: dict[str, OutputTable]
     """what the solver returns."""
-    constants: dict[str, float] = {}
+    constants: dict[str, float] = Field(default_factory=dict)
     """further values that it gets."""
     loads: tuple[str, ...] = ()
     """parameters of a load state, such as a pressure; the others are the same in all states."""

@@ -37,9 +37,7 @@ class Function:
     def _place(self, folder: Path) -> tuple[Path, str]:
         file, colon, name = self.function.rpartition(":")
         if not colon or not name.isidentifier():
-            raise InputError(
-                f"function = '{self.function}'; give file and name: 'model.py:solve'"
-            )
+            raise InputError(f"function = '{self.function}'; give file and name: 'model.py:solve'")
         path = folder / file
         if not path.is_file():
             raise InputError(f"function: there is no file {path}")
@@ -54,12 +52,13 @@ class Function:
         if folder not in self._functions:
             path, name = self._place(folder)
             spec = importlib.util.spec_from_file_location(path.stem, path)
-            assert spec is not None and spec.loader is not None
+            assert spec is not None
+            assert spec.loader is not None
             module = importlib.util.module_from_spec(spec)
             try:
                 spec.loader.exec_module(module)
                 self._functions[folder] = getattr(module, name)
-            except Exception as error:  # noqa: BLE001 - whatever a user's file raises
+            except Exception as error:
                 raise InputError(f"{path}: {type(error).__name__}: {error}") from error
         return self._functions[folder]
 
@@ -68,7 +67,7 @@ class Function:
         function = self._called(problem.folder)
         try:
             returned = function(**problem.values(theta))
-        except Exception as error:  # noqa: BLE001 - whatever a user's function raises
+        except Exception as error:
             raise SolverError(f"{self.function}: {type(error).__name__}: {error}") from error
         both = returned if isinstance(returned, tuple) else (returned, None)
         if len(both) != 2:

@@ -83,7 +83,7 @@ class TaughtOutputs(OutputsMap):
 
     def numbers(self, x: jax.Array) -> jax.Array:
         """Return all outputs (n,) at a position (p,) in the box."""
-        return self.outputs.constant + correction_at(self.outputs.correction, x)
+        return jnp.asarray(self.outputs.constant) + correction_at(self.outputs.correction, x)
 
     def data_of(self, question: str) -> DataProcess | None:
         """Return the process of the data that ``question`` asks for; None where it is another."""
@@ -97,8 +97,8 @@ class TaughtOutputs(OutputsMap):
     @classmethod
     def restored(cls, scene: ExternalProblem, arrays: Arrays) -> TaughtOutputs:
         """Return the map of :meth:`arrays`; ``KeyError`` where one is missing."""
-        both = (DataProcess.restore(inside(arrays, part)) for part in (_ALL, _DATA))
-        return cls(scene, all_nodes(scene), *both, record={})
+        outputs, data = (DataProcess.restore(inside(arrays, part)) for part in (_ALL, _DATA))
+        return cls(scene, all_nodes(scene), outputs, data, record={})
 
 
 def taught_outputs(

@@ -172,14 +172,17 @@ class ExternalProblem(ForwardProblem):
     @cached_property
     def places(self) -> dict[str, np.ndarray]:
         """The rows of the numbers of each output, by its name."""
-        ends = np.cumsum([output.size for output in self.outputs])
-        return {o.name: np.arange(end - o.size, end) for o, end in zip(self.outputs, ends)}
+        places, end = dict[str, np.ndarray](), 0
+        for output in self.outputs:
+            places[output.name] = np.arange(end, end + output.size)
+            end += output.size
+        return places
 
     def gradients(self, u: jax.Array) -> jax.Array:
         """Return zeros (1, 3, 3): outputs of another program deform nothing that is known here."""
         return jnp.zeros((1, 3, 3)) + 0.0 * u[:1, :1, None]
 
-    def tissue_at(self, theta: jax.Array) -> Any:
+    def tissue_at(self, theta: jax.Array) -> Any:  # noqa: ARG002
         """Raise :class:`InputError`: an external problem has no law of this package."""
         raise InputError(f"problem '{self.name}' is solved by another program, which has its law")
 

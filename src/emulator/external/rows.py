@@ -6,15 +6,16 @@ Each row has a run's parameters and outputs. With both standardised over the row
     \tau^2 \delta_{xx'}]\big), \qquad \rho^2 = \sum_k (x_k - x'_k)^2 / \ell_k^2,
 
 with Matern's correlation of smoothness 5/2,
-:math:`\kappa = (1 + \sqrt5 \rho + \tfrac53 \rho^2)\, e^{-\sqrt5 \rho}`, a linear trend, and a nugget
-for what a solver's tolerances scatter. Lengths, trend and nugget are those of the largest marginal
-likelihood times a log-normal prior of the lengths (median :math:`e^{3/2}\sqrt{p}`, log-sd 1: an
-input that does nothing has a long one), on 500 rows at most; :math:`a^2` is the most likely one.
+:math:`\kappa = (1 + \sqrt5 \rho + \tfrac53 \rho^2)\, e^{-\sqrt5 \rho}`, a linear trend, and a
+nugget for what a solver's tolerances scatter. Lengths, trend and nugget are those of the largest
+marginal likelihood times a log-normal prior of the lengths (median :math:`e^{3/2}\sqrt{p}`, log-sd
+1: an input that does nothing has a long one), on 500 rows at most; :math:`a^2` is the most likely
+one.
 
 The error at a row that is left out has a closed form, :math:`e_i = (K^{-1} y)_i / (K^{-1})_{ii}`
 (Rasmussen and Williams 2006, Eq. 5.12). It is too small where lengths were fitted to that row, too.
-So the process is first fitted without a fifth of the rows; by how much its standardised errors there
-exceed a Gaussian's at 90 % widens the sd of every output.
+So the process is first fitted without a fifth of the rows; by how much its standardised errors
+there exceed a Gaussian's at 90 % widens the sd of every output.
 """
 
 from __future__ import annotations
@@ -193,17 +194,15 @@ def _loss(logs: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
 
 
 def _fitted_logs(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the logarithms (n, p + 2) of each of the outputs (c, n) at positions (c, p)."""
+    """Return the logarithms (p + 2,) of the kernel of an output (c,) at positions (c, p)."""
     p = x.shape[1]
     # Evenly spaced rows: a table may be sorted.
     rows = np.unique(np.linspace(0, len(x) - 1, min(len(x), _MOST)).round().astype(int))
     low, high = np.append(np.full(p, -1.0), [-12.0, -16.0]), np.append(np.full(p, 8.0), [6.0, 3.0])
     start = np.append(np.full(p, _LOG_LENGTH + 0.5 * np.log(p)), [-2.0, -6.0])
     bounds: dict[str, Any] = {"low": low, "high": high, "iterations": 60, "tolerance": 1e-5}
-    some = jnp.asarray(x[rows])
-    return np.stack(
-        [minimise(lambda h, k=k: _loss(h, some, k), start, **bounds).x for k in y[rows].T]
-    )
+    at, values = jnp.asarray(x[rows]), jnp.asarray(y[rows])
+    return minimise(lambda logs: _loss(jnp.asarray(logs), at, values), start, **bounds).x
 
 
 class _Fit(NamedTuple):
@@ -246,7 +245,7 @@ def process_of(
 def _each(x: np.ndarray, y: np.ndarray, progress: Callable[[], Any]) -> np.ndarray:
     logs = []
     for column in y.T:
-        logs.append(_fitted_logs(x, column[:, None])[0])
+        logs.append(_fitted_logs(x, column))
         progress()
     return np.stack(logs)
 
@@ -261,7 +260,9 @@ def _excess(
         fit = _fit(logs, x[known], column[known])
         kernel = np.asarray(_kernel(jnp.asarray(logs), x[fresh], x[known]))
         error = column[fresh] - kernel @ fit.weights
-        ratios.append(np.abs(error) / np.sqrt(fit.variance * _variances(fit, logs, kernel, x[fresh])))
+        ratios.append(
+            np.abs(error) / np.sqrt(fit.variance * _variances(fit, logs, kernel, x[fresh]))
+        )
     return max(float(np.quantile(np.concatenate(ratios), 0.9)) / _NORMAL_90, 1.0)
 
 

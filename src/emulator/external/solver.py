@@ -55,12 +55,12 @@ class ExternalSimulator:
 
     def solve(self, theta: jax.Array, start: jax.Array | None = None) -> Solution:  # noqa: ARG002
         """Return the outputs at ``theta`` (p,), (n, 3) in the first column; there is no start."""
-        theta, outputs = np.asarray(theta, dtype=float), np.full(self.scene.node_count, np.nan)
+        point, outputs = np.asarray(theta, dtype=float), np.full(self.scene.node_count, np.nan)
         status = Status.CONVERGED
         try:
-            outputs = self._answer(theta).outputs
+            outputs = self._answer(point).outputs
         except SolverError as error:
-            values = ", ".join(f"{n} = {v:.6g}" for n, v in self.scene.values(theta).items())
+            values = ", ".join(f"{n} = {v:.6g}" for n, v in self.scene.values(point).items())
             tqdm.write(f"a run failed at {values}: {error}")
             status = Status.FAILED
         numbers = jnp.zeros((len(outputs), 3)).at[:, 0].set(outputs)

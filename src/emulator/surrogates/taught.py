@@ -80,7 +80,8 @@ class Taught(ForwardMap, Protocol):
     record : what is told of the rounds.
     """
 
-    data: DataProcess
+    @property
+    def data(self) -> DataProcess: ...  # noqa: D102
 
     @property
     def record(self) -> Mapping[str, Any]: ...  # noqa: D102
