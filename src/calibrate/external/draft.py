@@ -14,7 +14,7 @@ from emulator.core.cells import Cells, read_cells
 from emulator.core.errors import InputError
 from emulator.core.units import with_unit
 
-_LOG = 10.0  # ratio of the ends of a range from which its scale is logarithmic
+_LOG = 10.0  # ratio of the ends of a range from which its scale may be logarithmic
 
 
 class Draft(NamedTuple):
@@ -55,7 +55,7 @@ def draft_of_table(table: Path, out: Path, inputs: Sequence[str]) -> Draft:
             notes.append(f"'{word}' is {low:g} in all rows: left out")
             del columns[name]
             continue
-        scale = 'scale = "log"\n' if low > 0.0 and high > _LOG * low else ""
+        scale = 'scale = "log"\n' if _is_log(values) else ""
         blocks.append(
             f"[parameters.{name}]\n{_unit_of(word)}range = [{low:.10g}, {high:.10g}]"
             f"  # of the rows: the map answers nowhere else\n{scale}"
@@ -98,6 +98,16 @@ def _chosen(cells: Cells, inputs: Sequence[str]) -> list[str]:
         if word not in cells.words:
             raise InputError(f"--inputs: {cells.path} has no column '{word}'")
     return list(inputs)
+
+
+def _is_log(values: np.ndarray) -> bool:
+    """Return whether values are spread over the logarithms of their range, by their median."""
+    low, high = values.min(), values.max()
+    if low <= 0.0 or high <= _LOG * low:
+        return False
+    middle = np.median(values)
+    shares = np.log(middle / low) / np.log(high / low), (middle - low) / (high - low)
+    return bool(abs(shares[0] - 0.5) < abs(shares[1] - 0.5))
 
 
 def _numbers(cells: Cells, word: str, *, gaps: bool = False) -> np.ndarray:

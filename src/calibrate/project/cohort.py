@@ -35,6 +35,7 @@ from calibrate.project.rounds import by_rounds
 from calibrate.project.run import Run, with_absolute_paths
 from emulator.core.cells import SPREADSHEETS, TEXT, Cells, read_cells
 from emulator.core.errors import InputError
+from emulator.core.schema import read_toml
 
 EXPERIMENT = "experiment.toml"
 _SUBJECT, _GROUP = "subject", "group"
@@ -174,6 +175,8 @@ def _of_experiment(path: Path, entries: Mapping[str, Any]) -> Run:
     if not isinstance(problem, Problem):
         raise InputError(f"{path} has members of its own; a subject has one run")
     run = problem.run
+    if "prior" not in read_toml(path, "experiment file").data:
+        run = replace(run, prior=BOX)  # not the one that follows from this subject's scene
     for name, value in entries.items():
         before = getattr(run, name)
         both = isinstance(before, Mapping) and isinstance(value, Mapping) and name != "data"

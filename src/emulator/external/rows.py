@@ -9,7 +9,7 @@ with Matern's correlation of smoothness 5/2,
 :math:`\kappa = (1 + \sqrt5 \rho + \tfrac53 \rho^2)\, e^{-\sqrt5 \rho}`, a linear trend, and a
 nugget for what a solver's tolerances scatter. Lengths, trend and nugget are those of the largest
 marginal likelihood times a log-normal prior of the lengths (median :math:`e^{3/2}\sqrt{p}`, log-sd
-1: an input that does nothing has a long one), on 500 rows at most; :math:`a^2` is the most likely
+1: an input that does nothing has a long one), on 900 rows at most; :math:`a^2` is the most likely
 one.
 
 The error at a row that is left out has a closed form, :math:`e_i = (K^{-1} y)_i / (K^{-1})_{ii}`
@@ -46,7 +46,7 @@ from emulator.scenes.scene import all_nodes
 from emulator.surrogates.protocol import Arrays, ForwardKind, ForwardMap, fingerprint_of
 
 _FEWEST = 10  # rows
-_MOST = 500  # rows that lengths are fitted to
+_MOST, _MOST_TRIED = 900, 400  # rows that lengths are fitted to, and without held-out rows
 _HELD_OUT = 5  # one of so many rows is held out
 _NORMAL_90 = 1.6449  # sds that a Gaussian has 90 % within
 _LOG_LENGTH, _LOG_LENGTH_SD = 1.5, 1.0  # prior of a log length, less half the log of the inputs
@@ -108,6 +108,8 @@ def samples_of(problem: ForwardProblem) -> Samples:
     if not isinstance(problem, ExternalProblem) or not isinstance(problem.solver, Rows):
         raise InputError(f"problem '{problem.name}' is no table of runs")
     rows, path = problem.solver, problem.folder / problem.solver.file
+    if not path.is_file():
+        raise InputError(f"file: there is no table {path}")
     cells = read_cells(path)
 
     def column(name: str, *, gaps: bool) -> np.ndarray:
@@ -193,11 +195,14 @@ def _loss(logs: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
     return fit + prior / len(y)
 
 
-def _fitted_logs(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the logarithms (p + 2,) of the kernel of an output (c,) at positions (c, p)."""
+def _fitted_logs(x: np.ndarray, y: np.ndarray, most: int) -> np.ndarray:
+    """Return the logarithms (p + 2,) of the kernel of an output (c,) at positions (c, p).
+
+    most : the largest number of rows to fit it to.
+    """
     p = x.shape[1]
     # Evenly spaced rows: a table may be sorted.
-    rows = np.unique(np.linspace(0, len(x) - 1, min(len(x), _MOST)).round().astype(int))
+    rows = np.unique(np.linspace(0, len(x) - 1, min(len(x), most)).round().astype(int))
     low, high = np.append(np.full(p, -1.0), [-12.0, -16.0]), np.append(np.full(p, 8.0), [6.0, 3.0])
     start = np.append(np.full(p, _LOG_LENGTH + 0.5 * np.log(p)), [-2.0, -6.0])
     bounds: dict[str, Any] = {"low": low, "high": high, "iterations": 60, "tolerance": 1e-5}
@@ -234,7 +239,7 @@ def process_of(
     x, y = (positions - centre) / width, (outputs - mean) / sd
     held_out = np.arange(len(x)) % _HELD_OUT == _HELD_OUT - 1
     ratio = _excess(x, y, held_out, progress)
-    logs = _each(x, y, progress)
+    logs = _every(x, y, _MOST, progress)
     fits = [_fit(h, x, column) for h, column in zip(logs, y.T, strict=True)]
     left_out = np.stack([f.weights / np.diagonal(f.inverse) for f in fits], axis=1) * sd
     variance = np.array([f.variance for f in fits]) * ratio**2
@@ -242,10 +247,11 @@ def process_of(
     return Process(x, centre, width, mean, sd, logs, weights, variance, left_out)
 
 
-def _each(x: np.ndarray, y: np.ndarray, progress: Callable[[], Any]) -> np.ndarray:
+def _every(x: np.ndarray, y: np.ndarray, most: int, progress: Callable[[], Any]) -> np.ndarray:
+    """Return the logarithms (n, p + 2) of the kernels of all outputs (c, n)."""
     logs = []
     for column in y.T:
-        logs.append(_fitted_logs(x, column))
+        logs.append(_fitted_logs(x, column, most))
         progress()
     return np.stack(logs)
 
@@ -256,7 +262,7 @@ def _excess(
     """Return by how much errors at held-out rows exceed what processes of the others foresee."""
     known, fresh = ~held_out, held_out
     ratios = []
-    for logs, column in zip(_each(x[known], y[known], progress), y.T, strict=True):
+    for logs, column in zip(_every(x[known], y[known], _MOST_TRIED, progress), y.T, strict=True):
         fit = _fit(logs, x[known], column[known])
         kernel = np.asarray(_kernel(jnp.asarray(logs), x[fresh], x[known]))
         error = column[fresh] - kernel @ fit.weights

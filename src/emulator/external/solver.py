@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -61,7 +62,7 @@ class ExternalSimulator:
             outputs = self._answer(point).outputs
         except SolverError as error:
             values = ", ".join(f"{n} = {v:.6g}" for n, v in self.scene.values(point).items())
-            tqdm.write(f"a run failed at {values}: {error}")
+            tqdm.write(f"a run failed at {values}: {error}", file=sys.stderr)
             status = Status.FAILED
         numbers = jnp.zeros((len(outputs), 3)).at[:, 0].set(outputs)
         reached = jnp.asarray(float(status == Status.CONVERGED))

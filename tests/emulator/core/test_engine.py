@@ -1,0 +1,134 @@
+"""Many solves by any executor: the same results, in order, and what becomes of a worker's death."""
+
+import os
+import signal
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from multiprocessing import get_context
+from operator import neg
+
+import numpy as np
+import pytest
+
+import emulator as em
+from emulator.core.engine import Engine, engine_of
+from emulator.core.errors import InputError, SolverError
+from emulator.fem.campaign import run_campaign
+from emulator.fem.campaign.designs import sobol
+
+SPAWN = get_context("spawn")
+PROCESSES = "processes:2"
+
+
+class Bare:
+    """An executor with nothing but ``submit``, of futures with nothing but ``result``."""
+
+    def __init__(self):
+        self._pool = ThreadPoolExecutor(2)
+
+    def submit(self, function, *arguments):
+        """Return the future of one call."""
+        future = self._pool.submit(function, *arguments)
+        return type("BareFuture", (), {"result": lambda _: future.result(), "cancel": bool})()
+
+
+def die_once(path):
+    """Kill this process, if the file is there: once."""
+    if os.path.exists(path):  # noqa: PTH110
+        os.remove(path)  # noqa: PTH107
+        os.kill(os.getpid(), signal.SIGKILL)
+    return 1
+
+
+@pytest.fixture(scope="module")
+def beam():
+    """A beam of 16 elements, and theta."""
+    scene = em.scenes.once_clamped_beam(cells=(4, 1, 1), order=1)
+    return scene, sobol(scene, 6, 0)
+
+
+@pytest.mark.parametrize("executor", [Bare(), ThreadPoolExecutor(2), PROCESSES])
+def test_a_campaign_is_the_same_by_every_engine(beam, executor):
+    scene, thetas = beam
+    runs = {
+        where: run_campaign(em.Simulator(scene, executor=where), thetas, sensitivities=True)
+        for where in (Bare(), executor)
+    }
+    by_threads, by_engine = runs.values()
+    assert np.array_equal(by_threads.displacement, by_engine.displacement)
+    assert np.array_equal(by_threads.sensitivities, by_engine.sensitivities)
+
+
+def test_results_come_in_the_order_of_the_tasks_and_few_are_begun_early():
+    taken = []
+
+    def tasks():
+        for k in range(9):
+            taken.append(k)
+            yield k
+
+    results = Engine(ThreadPoolExecutor(2), 2).in_order(neg, tasks())
+    assert [next(results), len(taken)] == [0, 1]  # the first one is alone
+    assert [next(results), len(taken)] == [-1, 4]
+    assert list(results) == [-2, -3, -4, -5, -6, -7, -8]
+
+
+def test_tasks_of_a_worker_that_is_killed_are_done_again_and_named(tmp_path, capsys):
+    mark = tmp_path / "mark"
+    mark.touch()
+    engine = engine_of(PROCESSES)
+    assert list(engine.in_order(die_once, iter([str(mark)] * 4))) == [1, 1, 1, 1]
+    assert "a worker died; done again: run 1" in capsys.readouterr().err
+
+
+def test_a_task_that_kills_every_worker_is_named():
+    with pytest.raises(SolverError, match="3 workers died with run 2: out of memory"):
+        list(engine_of(PROCESSES).in_order(_fatal, iter([0, 1])))
+
+
+def _fatal(number):
+    if number:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def test_a_dead_worker_of_an_executor_that_cannot_be_replaced_is_named(tmp_path):
+    mark = tmp_path / "mark"
+    mark.touch()
+    pool = ProcessPoolExecutor(1, mp_context=SPAWN)
+    with pytest.raises(SolverError, match="died with run 1, and its executor cannot be replaced"):
+        list(engine_of(pool).in_order(die_once, iter([str(mark)])))
+
+
+def test_an_error_of_a_task_is_raised_as_it_is():
+    with pytest.raises(InputError, match="not a number"):
+        list(Engine(ThreadPoolExecutor(1), 1).in_order(_refuse, iter([0])))
+
+
+def _refuse(number):
+    raise InputError(f"{number} is not a number")
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        ("process:2", "engine 'process:2': give threads, processes:N or dask:ADDRESS"),
+        ("processes:0", "engine 'processes:0'"),
+        ("dask:", "engine 'dask:'"),
+        (3, "executor is a int; it has no submit"),
+    ],
+)
+def test_what_is_no_engine_is_refused(words, complaint):
+    with pytest.raises(InputError, match=complaint):
+        engine_of(words)
+
+
+def test_a_cluster_of_dask_gives_the_same(beam):
+    distributed = pytest.importorskip("distributed")
+    scene, thetas = beam
+    with (
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as made,
+        distributed.Client(made) as client,
+    ):
+        by_dask = run_campaign(em.Simulator(scene, executor=client.get_executor()), thetas)
+    by_threads = run_campaign(em.Simulator(scene, executor=Bare()), thetas)
+    assert np.array_equal(by_dask.displacement, by_threads.displacement)
