@@ -38,7 +38,13 @@ ROOMS = {
     "pages": ("calibrate.report", "calibrate.figures", "calibrate.explorer"),
     "serving": ("calibrate.um_bridge", "calibrate.local_server", "calibrate.cli.commands.serving"),
     "analyses": ("calibrate.analysis", "calibrate.cli.commands.analyses"),
-    "populations": ("calibrate.population", "calibrate.project.members"),
+    "populations": (
+        "calibrate.population",
+        "calibrate.project.members",
+        "calibrate.project.cohort",
+        "calibrate.cli.commands.cohort",
+    ),
+    "external": ("emulator.external", "calibrate.external"),
     "predictions": ("calibrate.prediction", "calibrate.cli.commands.prediction"),
     "released": (
         "emulator.released",
@@ -54,7 +60,7 @@ NEIGHBOURS = {
     "pages": {"analyses", "populations", "serving", "specimens"},
     "released": {"specimens"},
     "serving": {"pages"},
-    "populations": {"pages"},
+    "populations": {"pages", "specimens"},
     "predictions": {"pages", "populations", "specimens"},
 }
 """The rooms that a room reaches into."""

@@ -103,8 +103,12 @@ def _add_run(parser: ArgumentParser, more: Sequence[str]) -> None:
 
 def plan_of(arguments: Namespace) -> Run | Problem | Members:
     """Return the run, or the experiment file's problem or members, from :func:`run_options`."""
-    from calibrate.project.experiment import is_experiment_file, read_experiment
-    from calibrate.project.run import SYNTHETIC, Run, with_absolute_paths
+    from calibrate.project.experiment import (
+        is_experiment_file,
+        read_experiment,
+        with_absolute_paths,
+    )
+    from calibrate.project.run import SYNTHETIC, Run
 
     has_data_file = arguments.data not in (None, SYNTHETIC)
     for option in ("truth", "observe") if has_data_file else ():

@@ -167,9 +167,9 @@ def _moves(
             weights = normalised(
                 np.asarray(of_draws(u, thetas, stacked, jnp.asarray(error)) - base)
             )
-        moved = weights @ x
-        spread = np.sqrt(np.maximum(weights @ (x - moved) ** 2, 1e-300))
-        means.append((moved - mean) / sd)
+        shifted = weights @ x
+        spread = np.sqrt(np.maximum(weights @ (x - shifted) ** 2, 1e-300))
+        means.append((shifted - mean) / sd)
         logs.append(np.log(spread / sd))
         sizes.append(effective(weights))
     return _Moves(np.stack(means), np.stack(logs), np.array(sizes)), sds.reshape(

@@ -17,7 +17,7 @@ from emulator.core.units import with_unit
 _LOG = 10.0  # ratio of the ends of a range from which its scale may be logarithmic
 
 
-class Draft(NamedTuple):
+class TableDraft(NamedTuple):
     """What was written: the file, the names of parameters and outputs, and notes on both."""
 
     path: Path
@@ -26,7 +26,7 @@ class Draft(NamedTuple):
     notes: list[str]
 
 
-def draft_of_table(table: Path, out: Path, inputs: Sequence[str]) -> Draft:
+def draft_of_table(table: Path, out: Path, inputs: Sequence[str]) -> TableDraft:
     """Write the file of a problem that is a table of runs.
 
     Parameters
@@ -85,7 +85,7 @@ def draft_of_table(table: Path, out: Path, inputs: Sequence[str]) -> Draft:
     )
     head += f"columns = {{ {entries} }}\n" if renamed else ""
     out.write_text("\n".join([head, *blocks]), encoding="utf-8")
-    return Draft(out, parameters, outputs, notes)
+    return TableDraft(out, parameters, outputs, notes)
 
 
 def _chosen(cells: Cells, inputs: Sequence[str]) -> list[str]:

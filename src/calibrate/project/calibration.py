@@ -134,8 +134,7 @@ def certify_and_keep(
     Parameters
     ----------
     folder : the folder of the posterior.
-    load_steps : load steps of every solve.
-    executor : the executor, or the words of the engine, that does the solves, as of :func:`infer`.
+    load_steps, executor : load steps of every solve, and what does the solves, as of :func:`infer`.
     reweight_to : the folder that the reweighted posterior is written to, ready to be certified in
         its turn, where the verdict allows it.
     progress : whether progress bars, and the seconds of each stage, are shown.
@@ -143,7 +142,7 @@ def certify_and_keep(
         :func:`calibrate.certificate.examine`, with its errors.
     """
     stages, scene = Stages(show=progress), posterior.model.forward.scene
-    if scene.usual_map == "rows":
+    if not scene.has_solver:
         (examine_rows,) = offered("calibrate.external.by_rows", "examine_rows")
         of_rows: Certificate = examine_rows(posterior, Path(folder))
         write_json(Path(folder) / CERTIFICATE, of_rows.to_json())

@@ -28,11 +28,11 @@ from typing import Any
 import numpy as np
 
 from calibrate.priors.population import BOX, population_called
-from calibrate.project.experiment import read_experiment
+from calibrate.project.experiment import read_experiment, with_absolute_paths
 from calibrate.project.members import Members
 from calibrate.project.problem import Problem, read_problem
 from calibrate.project.rounds import by_rounds
-from calibrate.project.run import Run, with_absolute_paths
+from calibrate.project.run import Run
 from emulator.core.cells import SPREADSHEETS, TEXT, Cells, read_cells
 from emulator.core.errors import InputError
 from emulator.core.schema import read_toml

@@ -36,8 +36,8 @@ options of forward maps.
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
 
@@ -48,13 +48,16 @@ from calibrate.noise import NOISES
 from calibrate.priors.population import BOX, POPULATIONS, Population
 from calibrate.project.problem import Problem, naming, read_problem
 from calibrate.project.results import MEMBERS, POPULATION
-from calibrate.project.run import SYNTHETIC, Run, with_absolute_paths
+from calibrate.project.run import SYNTHETIC, Run
 from calibrate.samplers import SAMPLERS
 from emulator.core import schema
 from emulator.core.errors import InputError
 from emulator.core.gaussian_process import CORRELATIONS
 from emulator.core.schema import OneOf, Table, documented, json_schema, table_of
 from emulator.core.store import parse_text
+from emulator.scenes.finer import FINER
+from emulator.surrogates import shipped
+from emulator.surrogates.folders import KINDS
 from emulator.surrogates.registry import FORWARD_MAPS, forward_kind, known_options
 
 if TYPE_CHECKING:
@@ -129,6 +132,49 @@ def read_experiment(path: str | Path, entries: Mapping[str, Any] = {}) -> Proble
     with naming(file_name):
         runs = {name: member.run for name, member in problems.items()}
         return Members(runs, shared, problems=problems)
+
+
+def with_absolute_paths(entries: Mapping[str, Any], folder: Path = Path()) -> dict[str, Any]:
+    """Return the entries of a run with absolute paths, so that they hold in every folder.
+
+    Files and folders become absolute; names of built-in scenes and shipped emulators stay. A file
+    of a prior becomes its content: a run must not change with the file.
+
+    Parameters
+    ----------
+    entries : some fields of a run by name.
+    folder : the folder that relative paths start from.
+    """
+
+    def path(word: str) -> str:
+        return str((folder / word).resolve())
+
+    def scene(word: str) -> str:
+        change, _, of = word.partition(":")
+        if of and change == FINER:
+            return f"{FINER}:{scene(of)}"
+        return path(word) if word.endswith(".toml") else word
+
+    def data(word: str | dict[str, str]) -> str | dict[str, str]:
+        if isinstance(word, dict):
+            return {state: path(file) for state, file in word.items()}
+        return word if word == SYNTHETIC else path(word)
+
+    def emulator(word: str) -> str:
+        return word if word in (*shipped(), *KINDS) else path(word)
+
+    def prior(word: str | dict[str, Any]) -> str | dict[str, Any]:
+        if isinstance(word, str) and word.endswith(".json"):
+            return asdict(schema.read_json_as(Population, folder / word))
+        return word
+
+    resolve: dict[str, Callable[[Any], Any]] = {
+        "scene": scene, "root": path, "data": data, "emulator": emulator, "prior": prior,
+    }  # fmt: skip
+    return {
+        name: resolve[name](value) if name in resolve and value is not None else value
+        for name, value in entries.items()
+    }
 
 
 def _without(table: Mapping[str, Any], entries: Mapping[str, Any]) -> dict[str, Any]:

@@ -235,7 +235,7 @@ def by_rounds(problem: Problem) -> Problem:
     if scene.name in shipped() and scene.origin.get("scene") == scene.name:
         return problem
     mapped = read_problem(replace(run, forward=scene.usual_map), scene=scene)
-    if scene.usual_map == "rows":
+    if not scene.has_solver:
         (with_emulator_noise,) = offered("calibrate.external.by_rows", "with_emulator_noise")
         widened: Problem = with_emulator_noise(mapped)
         return widened

@@ -8,24 +8,19 @@ the JSON Schema (:mod:`calibrate.project.experiment`) and the options in the hel
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from calibrate.measurements import DISPLACEMENT, Observations
 from calibrate.measurements.usual_noise import usual_noise
 from calibrate.model_error.kinds import read_systematic
 from calibrate.noise import Noise, noise_of
-from calibrate.priors import Population
 from calibrate.state_names import split
 from calibrate.statistical_model import at_sites
 from emulator.core.engine import check_engine
 from emulator.core.errors import InputError
-from emulator.core.schema import read_json_as
-from emulator.scenes.finer import FINER
-from emulator.surrogates import registry, shipped
-from emulator.surrogates.folders import KINDS
+from emulator.surrogates import registry
 
 if TYPE_CHECKING:
     from calibrate.samplers import Sampler
@@ -185,46 +180,3 @@ def _by_name[T](
         return {DISPLACEMENT if len(bases) > 1 else bases[0]: values}
     observe.expand(values, what)
     return dict(values)
-
-
-def with_absolute_paths(entries: Mapping[str, Any], folder: Path = Path()) -> dict[str, Any]:
-    """Return the entries of a run with absolute paths, so that they hold in every folder.
-
-    Files and folders become absolute; names of built-in scenes and shipped emulators stay. A file
-    of a prior becomes its content: a run must not change with the file.
-
-    Parameters
-    ----------
-    entries : some fields of a run by name.
-    folder : the folder that relative paths start from.
-    """
-
-    def path(word: str) -> str:
-        return str((folder / word).resolve())
-
-    def scene(word: str) -> str:
-        change, _, of = word.partition(":")
-        if of and change == FINER:
-            return f"{FINER}:{scene(of)}"
-        return path(word) if word.endswith(".toml") else word
-
-    def data(word: str | dict[str, str]) -> str | dict[str, str]:
-        if isinstance(word, dict):
-            return {state: path(file) for state, file in word.items()}
-        return word if word == SYNTHETIC else path(word)
-
-    def emulator(word: str) -> str:
-        return word if word in (*shipped(), *KINDS) else path(word)
-
-    def prior(word: str | dict[str, Any]) -> str | dict[str, Any]:
-        if isinstance(word, str) and word.endswith(".json"):
-            return asdict(read_json_as(Population, folder / word))
-        return word
-
-    resolve: dict[str, Callable[[Any], Any]] = {
-        "scene": scene, "root": path, "data": data, "emulator": emulator, "prior": prior,
-    }  # fmt: skip
-    return {
-        name: resolve[name](value) if name in resolve and value is not None else value
-        for name, value in entries.items()
-    }

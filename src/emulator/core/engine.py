@@ -21,7 +21,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from dataclasses import dataclass, fields, is_dataclass
-from functools import cache
+from functools import cache, lru_cache
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -214,8 +214,10 @@ def _packed(thing: Any, digest: Callable[[Any], str | None]) -> bytes:
 
 
 # ---- in a worker ---------------------------------------------------------------------------------
-_OBJECTS: dict[str, Any] = {}
-"""What this worker was sent once, by digest, the last used at the end."""
+@lru_cache(_KEPT)
+def _slot(digest: str) -> list[Any]:  # noqa: ARG001 - its name
+    """Return where this worker keeps what it was sent once, empty before."""
+    return []
 
 
 class _Unpickler(pickle.Unpickler):
@@ -225,12 +227,10 @@ class _Unpickler(pickle.Unpickler):
 
     def persistent_load(self, digest: str) -> Any:
         """Return the object of ``digest``; ``KeyError`` where this worker was not sent it."""
-        if digest not in _OBJECTS:
-            _OBJECTS[digest] = _Unpickler(self._sent[digest], self._sent).load()
-        _OBJECTS[digest] = _OBJECTS.pop(digest)
-        while len(_OBJECTS) > _KEPT:
-            del _OBJECTS[next(iter(_OBJECTS))]
-        return _OBJECTS[digest]
+        slot = _slot(digest)
+        if not slot:
+            slot.append(_Unpickler(self._sent[digest], self._sent).load())
+        return slot[0]
 
 
 def _work(function: str, task: bytes, objects: Mapping[str, bytes], folder: str | None) -> Any:

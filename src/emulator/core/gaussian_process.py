@@ -44,7 +44,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jax.scipy.linalg import solve_triangular
 
 from emulator.core.minimise import minimise
 
@@ -99,6 +98,10 @@ class Regression(NamedTuple):
     def weights(self, observations: Any) -> Any:
         """Return K^-1 y of observations y (n, ...); times k(x, X) they are the mean at x."""
         return _linalg(self.factor).cho_solve((self.factor, True), observations)
+
+    def whitened(self, observations: Any) -> Any:
+        """Return observations y (n, ...) without their covariance, L^-1 y."""
+        return _linalg(self.factor).solve_triangular(self.factor, observations, lower=True)
 
     def inverse(self) -> Any:
         """Return K^-1, (n, n)."""
@@ -172,10 +175,10 @@ def negative_log_likelihood(features: Features, observations: jax.Array) -> jax.
     observations : values and derivatives of r outputs, input by input, (c (1 + p), r). The variance
         of each output is its most likely one, the mean square of its whitened observations.
     """
-    sd, (factor,) = _standardised(features)
-    white = solve_triangular(factor, observations / sd[:, None], lower=True)
+    sd, regression = _standardised(features)
+    white = regression.whitened(observations / sd[:, None])
     variances = jnp.mean(white**2, axis=0)
-    determinant = jnp.mean(jnp.log(jnp.diagonal(factor)) + jnp.log(sd))
+    determinant = jnp.mean(jnp.log(jnp.diagonal(regression.factor)) + jnp.log(sd))
     return 0.5 * jnp.mean(jnp.log(variances)) + determinant
 
 

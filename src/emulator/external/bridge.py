@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from emulator.core.errors import InputError, SolverError
-from emulator.external.problem import Answer, ExternalProblem
+from emulator.external.problem import ExternalProblem, RunAnswer
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Bridge:
         )
         try:
             with urllib.request.urlopen(post, timeout=self.time_limit) as answer:
-                told = json.loads(answer.read())
+                content = json.loads(answer.read())
         except urllib.error.HTTPError as error:
             fault = _error_in(error.read())
             kind, message = fault.get("type", f"HTTP {error.code}"), fault.get("message", "")
@@ -63,9 +63,9 @@ class Bridge:
         except (OSError, ValueError) as error:
             reason = getattr(error, "reason", error)
             raise InputError(f"no UM-Bridge server answers at {self.url}: {reason}") from None
-        if "error" in told:
-            raise SolverError(str(told["error"].get("message", told["error"])))
-        return dict(told)
+        if "error" in content:
+            raise SolverError(str(content["error"].get("message", content["error"])))
+        return dict(content)
 
     @cached_property
     def _sizes(self) -> tuple[list[int], list[int], frozenset[str]]:
@@ -75,7 +75,7 @@ class Bridge:
         support = self._ask("ModelInfo").get("support", {})
         return inputs, outputs, frozenset(name for name, yes in support.items() if yes)
 
-    def run(self, problem: ExternalProblem, theta: np.ndarray) -> Answer:
+    def run(self, problem: ExternalProblem, theta: np.ndarray) -> RunAnswer:
         """Return the model's answer at ``theta`` (p,), with derivatives where it has them."""
         inputs, outputs, supported = self._sizes
         values = [*map(float, theta), *problem.constants.values()]

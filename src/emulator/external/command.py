@@ -30,7 +30,7 @@ import numpy as np
 from emulator.core.errors import InputError, SolverError
 from emulator.core.machine import cores
 from emulator.core.store import write_json
-from emulator.external.problem import Answer, ExternalProblem, Output
+from emulator.external.problem import ExternalProblem, Output, RunAnswer
 
 INPUTS, OUTPUTS, LOG, ENDED = "inputs.json", "outputs.json", "log.txt", "answer.json"
 """Files of a run's folder: its values, its outputs, what it printed, and how it ended."""
@@ -72,7 +72,7 @@ class Command:
         if not self.time_limit > 0.0:
             raise InputError(f"time_limit is {self.time_limit:g}; give seconds above 0")
 
-    def run(self, problem: ExternalProblem, theta: np.ndarray) -> Answer:
+    def run(self, problem: ExternalProblem, theta: np.ndarray) -> RunAnswer:
         """Return the answer at ``theta`` (p,), of the run that ended, or of a new one."""
         values = problem.values(theta)
         folder = self._folder(problem, values)
@@ -201,10 +201,10 @@ def _outputs_in(folder: Path, problem: ExternalProblem) -> dict[str, Any]:
     """Return the outputs that a run left, as it is kept; or why it has none."""
     record: dict[str, Any] = {"outputs": {}}
     if any(not output.file for output in problem.outputs):
-        told = _json_in(folder / OUTPUTS)
-        if "gradients" in told:
-            record["gradients"] = told["gradients"]
-        record["outputs"] = dict(told.get("outputs", told))
+        content = _json_in(folder / OUTPUTS)
+        if "gradients" in content:
+            record["gradients"] = content["gradients"]
+        record["outputs"] = dict(content.get("outputs", content))
     for output in problem.outputs:
         if output.file:
             record["outputs"][output.name] = _read(folder, output)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from emulator.core.errors import InputError, SolverError
-from emulator.external.problem import Answer, ExternalProblem
+from emulator.external.problem import ExternalProblem, RunAnswer
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Function:
                 raise InputError(f"{path}: {type(error).__name__}: {error}") from error
         return self._functions[folder]
 
-    def run(self, problem: ExternalProblem, theta: np.ndarray) -> Answer:
+    def run(self, problem: ExternalProblem, theta: np.ndarray) -> RunAnswer:
         """Return the function's answer at ``theta`` (p,)."""
         function = self._called(problem.folder)
         try:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol, cast
 
 import jax
 import jax.numpy as jnp
@@ -76,7 +76,7 @@ class Output:
         return tuple(f"{self.name}.{k + 1}" for k in range(self.size))
 
 
-class Answer(NamedTuple):
+class RunAnswer(NamedTuple):
     """The answer of a solver at one theta.
 
     outputs : all numbers, (n,), in the order of the problem's outputs.
@@ -99,7 +99,7 @@ class ExternalSolver(Protocol):
     @property
     def at_once(self) -> int: ...  # noqa: D102
 
-    def run(self, problem: ExternalProblem, theta: np.ndarray) -> Answer:
+    def run(self, problem: ExternalProblem, theta: np.ndarray) -> RunAnswer:
         """Return the answer at ``theta`` (p,).
 
         :class:`SolverError` where this run failed, :class:`InputError` where any run would.
@@ -157,7 +157,12 @@ class ExternalProblem(ForwardProblem):
     @property
     def usual_map(self) -> str:
         """The forward map where none is named: the rows of a table, else rounds of runs."""
-        return getattr(self.solver, "usual_map", "rounds")
+        return super().usual_map if self.has_solver else cast(Any, self.solver).usual_map
+
+    @property
+    def has_solver(self) -> bool:
+        """Whether there is more than a table of runs that somebody made."""
+        return not hasattr(self.solver, "usual_map")
 
     @property
     def load_parameters(self) -> tuple[str, ...]:
@@ -210,7 +215,7 @@ class ExternalProblem(ForwardProblem):
             raise SolverError(f"output '{name}' is {array[~np.isfinite(array)][0]}")
         return array
 
-    def answer(self, outputs: Any, gradients: Any = None, what: str = "the solver") -> Answer:
+    def answer(self, outputs: Any, gradients: Any = None, what: str = "the solver") -> RunAnswer:
         """Return the answer from numbers by output, and derivatives by output and parameter.
 
         Parameters of which an output has no derivative do not move it. Errors as of
@@ -224,14 +229,14 @@ class ExternalProblem(ForwardProblem):
                 raise InputError(f"{what} returned no '{output.name}', but {known}")
         flat = [self.checked(o.name, outputs[o.name], what) for o in self.outputs]
         if not gradients:
-            return Answer(np.concatenate(flat))
+            return RunAnswer(np.concatenate(flat))
         slopes = np.zeros((self.node_count, len(self.parameters)))
         for name, by_parameter in gradients.items():
             for parameter, numbers in by_parameter.items():
                 if name in self.places and parameter in self.parameter_names:
                     column = self.parameter_names.index(parameter)
                     slopes[self.places[name], column] = self.checked(name, numbers, what)
-        return Answer(np.concatenate(flat), slopes)
+        return RunAnswer(np.concatenate(flat), slopes)
 
     def _owners(self) -> Owners:
         quantities = {

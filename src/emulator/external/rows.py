@@ -30,7 +30,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
 
 from emulator.core.cells import read_cells
 from emulator.core.display import counting
@@ -40,7 +39,7 @@ from emulator.core.kept import kept
 from emulator.core.machine import one_blas_thread
 from emulator.core.minimise import minimise
 from emulator.external.maps import OutputsMap
-from emulator.external.problem import Answer, ExternalProblem
+from emulator.external.problem import ExternalProblem, RunAnswer
 from emulator.scenes.forward_problem import ForwardProblem
 from emulator.scenes.scene import all_nodes
 from emulator.surrogates.protocol import Arrays, ForwardKind, ForwardMap, fingerprint_of
@@ -70,7 +69,7 @@ class Rows:
     at_once = 1
     usual_map = "rows"
 
-    def run(self, problem: ExternalProblem, theta: np.ndarray) -> Answer:  # noqa: ARG002
+    def run(self, problem: ExternalProblem, theta: np.ndarray) -> RunAnswer:  # noqa: ARG002
         """Raise :class:`InputError`: there is no solver."""
         raise InputError(
             f"problem '{problem.name}' is a table of runs; there is no solver that could make more"
@@ -84,7 +83,7 @@ class Rows:
         return [hashlib.sha256(path.read_bytes()).hexdigest(), self.columns]
 
 
-class Samples(NamedTuple):
+class TableRuns(NamedTuple):
     """Runs of a table: theta (c, p), and outputs (c, n); and how many rows were left out.
 
     failed : rows without an output. repeated : rows that are there before.
@@ -96,7 +95,7 @@ class Samples(NamedTuple):
     repeated: int
 
 
-def samples_of(problem: ForwardProblem) -> Samples:
+def samples_of(problem: ForwardProblem) -> TableRuns:
     """Return the runs in a problem's table.
 
     Raises
@@ -138,7 +137,7 @@ def samples_of(problem: ForwardProblem) -> Samples:
     if len(once) < least:
         raise InputError(f"{path} has {len(once)} runs with outputs; give {least} or more")
     failed, repeated = int((~known).sum()), int(known.sum()) - len(once)
-    return Samples(theta[known][once], outputs[known][once], failed, repeated)
+    return TableRuns(theta[known][once], outputs[known][once], failed, repeated)
 
 
 class Process(NamedTuple):
@@ -187,11 +186,11 @@ def _covariance(logs: Any, x: Any) -> jax.Array:
 @jax.value_and_grad
 def _loss(logs: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
     """Return minus the log marginal likelihood and log prior of y (c,), per number."""
-    factor = jnp.linalg.cholesky(_covariance(logs, x))
-    white = jax.scipy.linalg.solve_triangular(factor, y, lower=True)
+    regression = Regression.of(_covariance(logs, x))
+    white = regression.whitened(y)
     usual = _LOG_LENGTH + 0.5 * jnp.log(x.shape[1])
     prior = 0.5 * jnp.sum(((logs[: x.shape[1]] - usual) / _LOG_LENGTH_SD) ** 2)
-    fit = 0.5 * jnp.log(jnp.mean(white**2)) + jnp.mean(jnp.log(jnp.diagonal(factor)))
+    fit = 0.5 * jnp.log(jnp.mean(white**2)) + jnp.mean(jnp.log(jnp.diagonal(regression.factor)))
     return fit + prior / len(y)
 
 
@@ -317,10 +316,8 @@ class RowsMap(OutputsMap):
         errors, sds = [], []
         for k in outputs:
             logs = jnp.asarray(p.logs[k])
-            factor = Regression.of(np.asarray(_covariance(logs, p.at))).factor
-            whitened = scipy.linalg.solve_triangular(
-                factor, np.asarray(_kernel(logs, p.at, x)), lower=True
-            )
+            regression = Regression.of(np.asarray(_covariance(logs, p.at)))
+            whitened = regression.whitened(np.asarray(_kernel(logs, p.at, x)))
             remaining = np.asarray(_covariance(logs, x)) - whitened.T @ whitened
             remaining *= p.variance[k] * p.sd[k] ** 2
             values, vectors = np.linalg.eigh(remaining)  # singular where two draws are one

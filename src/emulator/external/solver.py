@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from emulator.core.engine import STAYS, Engine, engine_of
 from emulator.core.errors import SolverError
-from emulator.external.problem import Answer, ExternalProblem
+from emulator.external.problem import ExternalProblem, RunAnswer
 from emulator.fem.solution import Solution, Status
 
 
@@ -41,10 +41,10 @@ class ExternalSimulator:
         return engine
 
     @cached_property
-    def _answers(self) -> dict[bytes, Answer]:
+    def _answers(self) -> dict[bytes, RunAnswer]:
         return {}
 
-    def _answer(self, theta: np.ndarray) -> Answer:
+    def _answer(self, theta: np.ndarray) -> RunAnswer:
         """Return the answer at ``theta`` (p,), the last of which is kept for its derivatives."""
         key = theta.tobytes()
         if key not in self._answers:

@@ -67,6 +67,11 @@ class ForwardProblem(TableRepr):
         return "rounds"
 
     @property
+    def has_solver(self) -> bool:
+        """Whether there is more than a table of runs that somebody made."""
+        return True
+
+    @property
     def learned_in_box(self) -> bool:
         """Say whether a part of the problem was learned inside the box of theta only."""
         return False

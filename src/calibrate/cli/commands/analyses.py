@@ -278,7 +278,7 @@ def sensitivity(arguments: Namespace) -> Answer:
     from calibrate.analysis.sensitivity import indices_to_json, sensitivity
     from calibrate.measurements import parse_observation
     from calibrate.priors import prior_of
-    from calibrate.project.run import with_absolute_paths
+    from calibrate.project.experiment import with_absolute_paths
     from emulator import Simulator
     from emulator.surrogates.protocol import Ingredients
     from emulator.surrogates.registry import build_forward, full_options
