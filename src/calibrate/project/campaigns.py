@@ -33,6 +33,7 @@ def campaign(
     slopes: bool = False,
     out: str | Path | None = None,
     options: NewtonOptions | None = None,
+    executor: Executor | str | None = None,
     progress: bool = False,
 ) -> xr.Dataset:
     """Solve FEM at every theta of a design.
@@ -49,6 +50,7 @@ def campaign(
     seed : the seed of the design.
     thetas : the theta (c, p), in place of a design.
     slopes : solve for du/dtheta, too.
+    executor : what does the solves, as a :class:`~emulator.fem.simulator.Simulator`'s.
     out : the Zarr store to write; without it the dataset is in memory.
 
     Returns
@@ -62,7 +64,14 @@ def campaign(
         No samples and no theta; a store of another campaign.
     """
     plan = question(
-        scene, samples, thetas=thetas, design=design, seed=seed, slopes=slopes, options=options
+        scene,
+        samples,
+        thetas=thetas,
+        design=design,
+        seed=seed,
+        slopes=slopes,
+        options=options,
+        executor=executor,
     )
     store = zarr.storage.MemoryStore() if out is None else out
     fill(plan, store, progress=progress)

@@ -22,7 +22,7 @@ from calibrate.population.posterior import CORRELATION
 from calibrate.posterior import read_tree
 from calibrate.posterior.diagnosis import misfits
 from calibrate.project.calibration import NOT_CERTIFIED
-from calibrate.project.members import Members, Shared, verdicts_in
+from calibrate.project.members import Members, Shared, failures_in, verdicts_in
 from calibrate.project.results import MEMBERS, POPULATION, POSTERIOR, REPORT
 from calibrate.report import charts, parts
 from calibrate.report.parts import Verdict
@@ -64,13 +64,17 @@ def html_of(plan: Members, population: Hierarchy, folder: Path, page_folder: Pat
     sections = [
         ("The population", [parts.table(("", *parts.SUMMARY), rows), before_the_cut]),
         ("Members beside the population", _members(population, folder, page_folder, verdicts)),
+        *([("Groups", _groups(plan, population))] if plan.groups else []),
         ("A member not seen", new_member),
         ("How sampling went", _sampling(population, table, warnings)),
         ("Where this comes from, and how to repeat it", _provenance(plan, population)),
     ]
     heading = f"Population of {len(population.members)} members"
     title = f"{heading}: {', '.join(population.shared)}"
-    return parts.render(title, heading, _verdict(verdicts, warnings), sections)
+    verdict = _verdict(verdicts, warnings)
+    failed = [f"left out: {name}, {why}" for name, why in failures_in(folder).items()]
+    verdict = verdict._replace(findings=[*verdict.findings, *failed])
+    return parts.render(title, heading, verdict, sections)
 
 
 def _verdict(verdicts: Mapping[str, str], warnings: Sequence[str]) -> Verdict:
@@ -90,6 +94,23 @@ def _verdict(verdicts: Mapping[str, str], warnings: Sequence[str]) -> Verdict:
         findings.append(f"for a certificate: calibrate certify on {MEMBERS}/NAME in this folder")
     basis = "A certificate is of a member by itself, not of the population."
     return Verdict(text, worst, findings, basis, warnings)
+
+
+def _groups(plan: Members, population: Hierarchy) -> list[Markup]:
+    """Return the median over each group's members of every parameter, with its 90 %."""
+    draws, rows = population.draws(), []
+    for group in dict.fromkeys(plan.groups.values()):
+        members = [name for name in population.members if plan.groups.get(name) == group]
+        if members:
+            values = [
+                np.median([draws[f"{name}[{member}]"] for member in members], axis=0)
+                for name in population.shared
+            ]
+            row = (parts.median_and_range(v, _FORM) for v in values)
+            rows.append((group, str(len(members)), *row))
+    labels = [label_of(population, name) for name in population.shared]
+    note = "The median of a group's members, as the whole population has them; 90 % of its draws."
+    return [parts.note(note), parts.table(("", "members", *labels), rows)]
 
 
 def _labels(population: Hierarchy) -> dict[str, str]:

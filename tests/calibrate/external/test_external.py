@@ -2,17 +2,20 @@
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import calibrate as cal
 import emulator as em
 from calibrate.cli import main
 from calibrate.measurements import kinds_of, observations_from_json, parse_observation
 from calibrate.project import read_posterior
 from cli_support import answer, complaint
 from emulator.catalogue import find_problem
+from emulator.external.solver import ExternalSimulator
 
 PROBLEM = """
 loads = ["force"]
@@ -128,6 +131,21 @@ def test_its_posterior_is_read_again_certified_and_reported(calibrated, capsys):
     assert (code, again["verdict"]) == (0, "accepted")
     assert main(["report", str(folder / "run")]) == 0
     assert "extension" in (folder / "run" / "report.html").read_text()
+
+
+def test_a_wrong_map_of_a_solver_is_refused(calibrated):
+    _, posterior = read_posterior(calibrated[0] / "run")
+    model = posterior.model
+    data = replace(model.full.data, constant=model.full.data.constant + 0.05)
+    wrong = replace(model.full, data=data)
+    forward = wrong.at(model.observe.nodes)
+    lied = cal.sample(
+        replace(model, full=wrong, forward=forward), posterior.data, sampler="nuts",
+        options=cal.samplers.NUTSOptions(warmup=200, draws=250),
+    )  # fmt: skip
+    solver = ExternalSimulator(model.forward.scene)
+    assert cal.certify(posterior, solver, mesh=0).verdict == "accepted"
+    assert cal.certify(lied, solver, mesh=0).verdict in ("not certified", "reweight")
 
 
 def test_observations_of_outputs_are_named_as_in_the_file(tmp_path):
