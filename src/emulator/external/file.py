@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from emulator.core.errors import InputError
-from emulator.core.schema import OneOf, Source, Table, parse
+from emulator.core.schema import OneOf, Source, Table, parse, table_of
 from emulator.external.bridge import Bridge
 from emulator.external.command import Command
 from emulator.external.function import Function
@@ -21,27 +21,6 @@ SOLVERS: dict[str, type] = {kind.kind: kind for kind in (Command, Function, Brid
 """Ways to ask a solver, by their names in files."""
 
 
-class OutputTable(Table):
-    """One output, and where a command leaves it."""
-
-    unit: str = ""
-    """of its numbers; left out when dimensionless."""
-    size: int = 1
-    """the number of its numbers."""
-    file: str = ""
-    """file of a run; by default outputs.json, under its name."""
-    column: str = ""
-    """column of that file, a CSV table; the last rows are taken, as many as its size."""
-    pattern: str = ""
-    """regular expression whose groups are its numbers, where it last matches."""
-    field: str = ""
-    """point field of that file, of any format that meshio reads."""
-    point: int = 0
-    """number of the point of that field, from 0."""
-    component: int = 0
-    """component of a vector at that point, from 0."""
-
-
 class ProblemFile(Table):
     """A whole file of an external problem."""
 
@@ -49,8 +28,8 @@ class ProblemFile(Table):
     """how somebody else's solver is asked."""
     parameters: dict[str, ParameterTable]
     """what varies, with a range or a log-normal prior."""
-    outputs: dict[str, OutputTable]
-    """what the solver returns."""
+    outputs: dict[str, table_of(Output)]  # type: ignore[valid-type]
+    """what the solver returns, by name."""
     constants: dict[str, float] = Field(default_factory=dict)
     """further values that it gets."""
     loads: tuple[str, ...] = ()
@@ -67,7 +46,7 @@ def read_external(path: Path, source: Source, parameter: Any) -> ExternalProblem
     outputs, parameters = list[Output](), list[Parameter]()
     for name, entry in file.outputs.items():
         with source.at("outputs", name, table=("outputs", name)):
-            outputs.append(Output(name, **entry.model_dump()))
+            outputs.append(Output(name, **entry.model_dump(exclude_unset=True)))
     for name, table in file.parameters.items():
         with source.at("parameters", name, table=("parameters", name)):
             parameters.append(parameter(name, table, ()))

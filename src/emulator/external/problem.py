@@ -45,7 +45,7 @@ class Output:
     point : the number of the point of that field, from 0. component : of a vector, from 0.
     """
 
-    name: str
+    name: str = field(compare=False)  # the key of its table
     unit: str = ""
     size: int = 1
     file: str = ""
