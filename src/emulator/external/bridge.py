@@ -96,10 +96,11 @@ class Bridge:
         answer = problem.answer({name: flat[rows] for name, rows in problem.places.items()})
         if "Gradient" not in supported and "ApplyJacobian" not in supported:
             return answer
-        slopes = self._slopes(parts, len(theta), "Gradient" in supported)
+        few = "ApplyJacobian" in supported and len(theta) <= problem.node_count
+        slopes = self._slopes(parts, len(theta), backwards="Gradient" in supported and not few)
         return answer._replace(gradients=slopes)
 
-    def _slopes(self, parts: list[list[float]], parameters: int, backwards: bool) -> np.ndarray:
+    def _slopes(self, parts: list[list[float]], parameters: int, *, backwards: bool) -> np.ndarray:
         """Return derivatives (n, p), by a request for each output's number or each parameter.
 
         backwards : whether the model gives gradients of an output; else derivatives along inputs.
