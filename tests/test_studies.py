@@ -44,6 +44,7 @@ QUICK = {
     "stability": "--workers 1 --cases theta_zero_inside_jit theta_too_short pushed_through_itself "
     "squeezed_to_half elements_10000_to_1 springs_1e12 twist_360_from_rest laplace_two_modes float32_once_clamped_beam "
     "outside_by_half_once_clamped_beam",
+    "tables": "--quick",
     "terms": "--quick",
     "any_ventricle": "--quick",
     "verification": "--quick",

@@ -160,7 +160,11 @@ def infer_members(
         engine, names = engine_of(executor), iter(plan.members)
         if engine is not None:  # whose workers each have a process, and so all of a run's threads
             calibrate = replace(calibrate, progress=False, here=False)
-        done = map(calibrate, names) if engine is None else engine.in_order(calibrate, names)
+        done = (
+            map(calibrate, names)
+            if engine is None
+            else engine.in_order(calibrate, names, alone=0, ahead=len(plan.members))
+        )
         for name, (posterior, verdict) in zip(plan.members, done, strict=True):
             if verdict is not None:
                 verdicts[name] = verdict

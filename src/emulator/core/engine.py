@@ -56,12 +56,17 @@ class Engine:
         self._executor, self._renewed = executor, renewed
 
     def in_order[T, R](
-        self, function: Callable[[T], R], tasks: Iterator[T], *, alone: int = 1
+        self,
+        function: Callable[[T], R],
+        tasks: Iterator[T],
+        *,
+        alone: int = 1,
+        ahead: int | None = None,
     ) -> Iterator[R]:
         """Yield ``function`` of every task, in the order of the tasks.
 
         The first ``alone`` tasks come one after the other. Then a task is taken when all but
-        ``workers`` of the results before it have been yielded.
+        ``ahead`` of the results before it have been yielded, by default as many as workers.
 
         :class:`SolverError` where workers die of one task, or one dies whom nothing replaces.
         """
@@ -70,7 +75,7 @@ class Engine:
             for number, task in enumerate(tasks):
                 pending.append(_Sent(number, sender.packed(task)))
                 self._submit(pending, sender)
-                while len(pending) > (self.workers if number >= alone else 0):
+                while len(pending) > ((ahead or self.workers) if number >= alone else 0):
                     yield self._first(pending, sender)
             while pending:
                 yield self._first(pending, sender)

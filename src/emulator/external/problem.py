@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.errors import InputError, SolverError
+from emulator.mechanics.laws import Law
 from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.forward_problem import ForwardProblem, Owners
 from emulator.scenes.identity import Identity, described, fingerprint
@@ -187,9 +188,17 @@ class ExternalProblem(ForwardProblem):
         """Return zeros (1, 3, 3): outputs of another program deform nothing that is known here."""
         return jnp.zeros((1, 3, 3)) + 0.0 * u[:1, :1, None]
 
-    def tissue_at(self, theta: jax.Array) -> Any:  # noqa: ARG002
+    @property
+    def law(self) -> Law:  # type: ignore[override]
         """Raise :class:`InputError`: an external problem has no law of this package."""
-        raise InputError(f"problem '{self.name}' is solved by another program, which has its law")
+        raise InputError(
+            f"this needs a law, and problem '{self.name}' is solved by another program, which has "
+            "its own"
+        )
+
+    def tissue_at(self, theta: jax.Array) -> Any:  # noqa: ARG002
+        """Raise :class:`InputError`, as :attr:`law` does."""
+        return self.law
 
     def values(self, theta: np.ndarray) -> dict[str, float]:
         """Return what the solver gets at ``theta`` (p,), by name."""

@@ -198,6 +198,16 @@ def test_a_solver_that_fails_at_most_of_the_prior_is_said_so(tmp_path, capsys):
     assert "no convergence" in told
 
 
+def test_what_needs_a_law_or_a_mesh_says_so(calibrated, capsys):
+    folder = calibrated[0]
+    assert main(["identify", "after", str(folder / "run")]) == 0
+    assert "stress along" not in capsys.readouterr().out
+    predict = ("predict", folder / "run", "--scene", folder / "bar.toml", "--observe", "extension")
+    assert "this needs a law" in complaint(capsys, *predict, "--out", folder / "p")
+    effects = ("effects", folder / "bar.toml", "--observe", "extension", "--tolerance", "0.1")
+    assert "another program's, which has no mesh" in complaint(capsys, *effects)
+
+
 def simulated(folder, capsys, *theta):
     """The answer of ``simulate``."""
     return answer(capsys, "simulate", folder / "bar.toml", "--theta", *theta)

@@ -72,7 +72,8 @@ def _after(arguments: Namespace) -> Answer:
     run, posterior = read_posterior(arguments.folder)
     result = identify(posterior)
     lines = [in_words(result)]
-    for direction in ("fibre", "cross-fibre"):
+    scene = posterior.model.forward.scene
+    for direction in () if scene.outside else ("fibre", "cross-fibre"):
         band = stress_band(posterior, direction, stretches=[1.1, 1.2])
         stresses = ", ".join(
             f"{m:.3g} kPa ({low:.3g} to {high:.3g}) at {s:g}"
@@ -86,7 +87,6 @@ def _after(arguments: Namespace) -> Answer:
             f"by likelihood alone, {name} is {profile.low:.4g} to {profile.high:.4g} (95 %)"
         )
         result[f"profile {name}"] = [profile.low, profile.high]
-    scene = posterior.model.forward.scene
     candidates = {}
     for word in "+".join(arguments.next).split("+") if arguments.next else ():
         (part,) = parse_observation(scene, word, run.seed).parts.values()

@@ -1,0 +1,159 @@
+"""Tables of somebody else's runs: what a Gaussian process of their rows says of rows kept apart.
+
+    python -m studies.tables --data DIR      # DIR/cardiacN/processed/{parameters,outputs}.csv
+    python -m studies.tables --quick         # a table made here
+
+The rows are shuffled once; every fifth is kept apart. Its outputs are predicted, with their 90 %;
+then ten of these rows are data, with noise of 2 % of each output's sd, and their inputs are
+inferred.
+Writes results.json after each table, and tables.png.
+"""
+
+import csv
+import tempfile
+from pathlib import Path
+from time import perf_counter
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from studies.common.figures import BLUE, GREEN, pyplot
+from studies.common.output import Case, Results, parser, save
+
+import calibrate as cal
+
+HERE = Path(__file__).parent
+SEED = 0
+HELD_OUT = 5  # one row of so many
+NOISE = 0.02  # sd of the data, in sds of each output over the rows
+POSTERIORS = 10
+MOST_INPUTS = 9  # of tables whose inputs are inferred
+OPTIONS = cal.samplers.NUTSOptions(warmup=300, draws=400, chains=2)
+
+
+def read(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The inputs (c, p) and the outputs (c, n) of a table."""
+    tables = []
+    for name in ("parameters", "outputs"):
+        with (folder / f"{name}.csv").open(newline="") as file:
+            _, *rows = csv.reader(file)
+        tables.append(np.array(rows, dtype=float))
+    return tables[0], tables[1]
+
+
+def made(rows: int = 90) -> tuple[np.ndarray, np.ndarray]:
+    """A table of three inputs, of which one does nothing, and two outputs."""
+    x = np.random.default_rng(SEED).random((rows, 3))
+    return x, np.stack([np.sin(2.0 * x[:, 0]) + x[:, 1], np.exp(x[:, 1] - x[:, 0])], axis=1)
+
+
+def write(folder: Path, x: np.ndarray, y: np.ndarray, data: np.ndarray) -> Path:
+    """The files of a problem: its table, a file of data, and an experiment."""
+    inputs, outputs = [f"x{k}" for k in range(x.shape[1])], [f"y{k}" for k in range(y.shape[1])]
+    for name, head, rows in (
+        ("runs", [*inputs, *outputs], np.hstack([x, y])),
+        ("data", outputs, data[None]),
+    ):
+        with (folder / f"{name}.csv").open("w", newline="") as file:
+            csv.writer(file).writerows([head, *rows.tolist()])
+    text = '[solver]\nkind = "table"\nfile = "runs.csv"\n'
+    for name, column in zip(inputs, x.T, strict=True):
+        low, high = float(column.min()), float(column.max())
+        text += f"[parameters.{name}]\nrange = [{low!r}, {high!r}]\n"
+    text += "".join(f"[outputs.{name}]\n" for name in outputs)
+    (folder / "table.toml").write_text(text)
+    noise = "".join(
+        f"{n} = {NOISE * sd:.8g}\n" for n, sd in zip(outputs, y.std(axis=0), strict=True)
+    )
+    bounded = ", ".join(f'"{name}"' for name in inputs)
+    experiment = (
+        f'scene = "table.toml"\ndata = "data.csv"\nbounded = [{bounded}]\nsampler = "nuts"\n'
+    )
+    experiment += "warmup = 300\ndraws = 400\nchains = 2\n[noise]\n"
+    (folder / "experiment.toml").write_text(experiment + noise)
+    return folder / "experiment.toml"
+
+
+def case(x: np.ndarray, y: np.ndarray, posteriors: int) -> Case:
+    """Errors of outputs of rows kept apart, and coverage of the inputs of some of them."""
+    order = np.random.default_rng(SEED).permutation(len(x))
+    apart, known = order[: len(x) // HELD_OUT], order[len(x) // HELD_OUT :]
+    inside = ((x[apart] >= x[known].min(axis=0)) & (x[apart] <= x[known].max(axis=0))).all(axis=1)
+    apart = apart[inside]  # the map answers nowhere else
+    rng = np.random.default_rng([SEED, 1])
+    data = y[apart] + NOISE * y[known].std(axis=0) * rng.normal(size=y[apart].shape)
+    with tempfile.TemporaryDirectory() as folder:
+        path = write(Path(folder), x[known], y[known], data[0])
+        begin = perf_counter()
+        posterior = cal.infer(cal.read_experiment(path))
+        seconds = perf_counter() - begin
+        full = posterior.model.full
+        predicted = np.asarray(jax.vmap(full)(jnp.asarray(x[apart])))[..., 0]
+        _, sds = full.drawn_errors(x[apart], np.arange(y.shape[1]), 1, rng)
+        found = [posterior.draws()]
+        names = posterior.model.observe.parts
+        for row in data[1:posteriors]:
+            values = dict(zip(names, row, strict=True))
+            found.append(
+                cal.sample(posterior.model, values, sampler="nuts", options=OPTIONS).draws()
+            )
+    errors = predicted - y[apart]
+    r2 = 1.0 - (errors**2).sum(axis=0) / ((y[apart] - y[apart].mean(axis=0)) ** 2).sum(axis=0)
+    covered = [
+        np.mean(draws[f"x{k}"] < x[row, k])
+        for row, draws in zip(apart[:posteriors], found, strict=True)
+        for k in range(x.shape[1])
+    ]
+    ranks = np.array(covered)
+    return {
+        "rows": len(x),
+        "inputs": x.shape[1],
+        "outputs": y.shape[1],
+        "r2": float(r2.mean()),
+        "r2_least": float(r2.min()),
+        "inside_90": float((np.abs(errors) < 1.645 * sds).mean()),
+        "seconds_to_first_posterior": seconds,
+        "posteriors": len(found),
+        "inputs_inside_90": float(((ranks > 0.05) & (ranks < 0.95)).mean()),
+    }
+
+
+def draw(cases: list[Case], path: Path) -> None:
+    """R2 and coverage of each table."""
+    figure, axes = pyplot().subplots(1, 2, figsize=(9, 3), layout="constrained")
+    names = [c["name"] for c in cases]
+    axes[0].barh(names, [1.0 - c["r2"] for c in cases], color=BLUE)
+    axes[0].set(xlabel="1 - R2 of outputs kept apart, mean", xscale="log")
+    axes[1].barh(names, [c["inside_90"] for c in cases], color=GREEN)
+    axes[1].axvspan(0.85, 0.95, color="grey", alpha=0.25)
+    axes[1].axvline(0.9, color="grey")
+    axes[1].set(xlabel="share of them inside 90 %", xlim=(0.5, 1.0))
+    for axis in axes:
+        axis.invert_yaxis()
+    save(figure, path)
+
+
+def main() -> None:
+    """Make the cases, results.json and the picture."""
+    words = parser(__doc__, HERE)
+    words.add_argument("--data", type=Path, help="folder of tables")
+    arguments = words.parse_args()
+    results = Results(arguments.out, SEED, again=arguments.again)
+    tables = {} if arguments.data is None else {
+        folder.name: folder / "processed" for folder in sorted(arguments.data.glob("cardiac*"))
+        if (folder / "processed" / "outputs.csv").is_file()
+    }  # fmt: skip
+    if not tables or arguments.quick:
+        results.case("made", lambda: case(*made(), 2))
+    for name, folder in {} if arguments.quick else tables.items():
+        x, y = read(folder)
+        count = POSTERIORS if x.shape[1] <= MOST_INPUTS else 1
+        results.case(name, lambda x=x, y=y, count=count: case(x, y, count))
+    results.write()
+    draw(results.cases, arguments.out / "tables.png")
+    for done in results.cases:
+        assert done["inside_90"] > 0.8, done["name"]
+
+
+if __name__ == "__main__":
+    main()
