@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from calibrate.cli import main
+from calibrate.project import read_posterior
 from calibrate.project.cohort import read_cohort
 from calibrate.project.members import read_members
 from cli_support import answer, complaint
@@ -59,12 +60,15 @@ def test_priors_that_follow_from_the_data_are_one_for_all(cohort):
 
 def test_the_same_command_goes_on_where_it_stopped(cohort, capsys):
     (cohort / "posterior.nc").unlink()
+    by_process = read_posterior(cohort / "members" / "b")[1].draws()["mu"]
     shutil.rmtree(cohort / "members" / "b")
     before = (cohort / "members" / "a" / "posterior.nc").stat().st_mtime_ns
     code, told = answer(capsys, "cohort", cohort.parent / "subjects.csv", *FEW, "--out", cohort)
     assert code == 1  # of d
     assert list(told["failed"]) == ["d"]
     assert list(told["members"]) == ["a", "b", "c"]
+    here = read_posterior(cohort / "members" / "b")[1].draws()["mu"]
+    assert np.allclose(here, by_process, rtol=1e-12)
     assert (cohort / "members" / "a" / "posterior.nc").stat().st_mtime_ns == before
 
 
