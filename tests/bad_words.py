@@ -81,6 +81,8 @@ COMMANDS = [
     ("verify published /no/where", "does not exist"),
     ("verify published", "give the folder of the released data"),
     ("verify patches", "case 'patches' is unknown; known: patch"),
+    ("cohort none.csv --out cohort", "none.csv does not exist; give a table of subjects"),
+    ("infer once_clamped_beam --engine slurm --out run", "give threads, processes:N or dask"),
     ("certify /no/where", "run.json does not exist"),
     (
         "sensitivity once_clamped_beam --observe reaction:tip:z",

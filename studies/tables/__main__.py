@@ -49,6 +49,8 @@ def made(rows: int = 90) -> tuple[np.ndarray, np.ndarray]:
 
 def write(folder: Path, x: np.ndarray, y: np.ndarray, data: np.ndarray) -> Path:
     """The files of a problem: its table, a file of data, and an experiment."""
+    # Of many inputs only the map is looked at, not the posterior.
+    sampler = "nuts" if x.shape[1] <= MOST_INPUTS else "laplace"
     inputs, outputs = [f"x{k}" for k in range(x.shape[1])], [f"y{k}" for k in range(y.shape[1])]
     for name, head, rows in (
         ("runs", [*inputs, *outputs], np.hstack([x, y])),
@@ -66,10 +68,8 @@ def write(folder: Path, x: np.ndarray, y: np.ndarray, data: np.ndarray) -> Path:
         f"{n} = {NOISE * sd:.8g}\n" for n, sd in zip(outputs, y.std(axis=0), strict=True)
     )
     bounded = ", ".join(f'"{name}"' for name in inputs)
-    experiment = (
-        f'scene = "table.toml"\ndata = "data.csv"\nbounded = [{bounded}]\nsampler = "nuts"\n'
-    )
-    experiment += "warmup = 300\ndraws = 400\nchains = 2\n[noise]\n"
+    experiment = f'scene = "table.toml"\ndata = "data.csv"\nbounded = [{bounded}]\n'
+    experiment += f'draws = 400\nchains = 2\nsampler = "{sampler}"\n[noise]\n'
     (folder / "experiment.toml").write_text(experiment + noise)
     return folder / "experiment.toml"
 
@@ -139,10 +139,8 @@ def main() -> None:
     words.add_argument("--data", type=Path, help="folder of tables")
     arguments = words.parse_args()
     results = Results(arguments.out, SEED, again=arguments.again)
-    tables = {} if arguments.data is None else {
-        folder.name: folder / "processed" for folder in sorted(arguments.data.glob("cardiac*"))
-        if (folder / "processed" / "outputs.csv").is_file()
-    }  # fmt: skip
+    found = [] if arguments.data is None else arguments.data.glob("cardiac*/processed/outputs.csv")
+    tables = {path.parts[-3]: path.parent for path in sorted(found, reverse=True)}  # small first
     if not tables or arguments.quick:
         results.case("made", lambda: case(*made(), 2))
     for name, folder in {} if arguments.quick else tables.items():

@@ -117,7 +117,7 @@ def test_it_is_inferred_with_and_certified(tmp_path, capsys):
         (["--fem-runs", "9"], "--fem-runs has no effect without --forward reduced"),
         (["--forward", "polynomial", "--steps", "2"], "--steps has no effect without --forward co"),
         (["--forward", "polynomial", "--order", "-1"], "order is -1; it must be 0 or more"),
-        (["--forward", "spline"], "fem, homogeneous, incompressible, polynomial"),
+        (["--forward", "spline"], "fem, homogeneous, incompressible, rows, polynomial"),
     ],
 )
 def test_its_options_are_checked_everywhere(tmp_path, capsys, command, words, message):

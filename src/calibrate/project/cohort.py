@@ -59,6 +59,8 @@ def read_cohort(path: str | Path, out: str | Path, law: str | None = None) -> Me
     path, drafts = Path(path), Path(out) / "drafts"
     if path.is_dir():
         return _of_folders(path, drafts, law)
+    if not path.is_file():
+        raise InputError(f"{path} does not exist; give a table of subjects, or a folder of them")
     cells = read_cells(path)
     _check_columns(cells)
     runs, groups, unread = dict[str, Run](), dict[str, str](), dict[str, str]()

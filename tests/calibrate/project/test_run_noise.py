@@ -75,7 +75,7 @@ def test_a_discrepancy_is_noise_that_correlates_of_an_sd_that_is_inferred(beam):
 
 def test_synthetic_data_has_the_noise_of_the_run(beam, monkeypatch):
     monkeypatch.setattr(
-        "calibrate.project.problem.simulator_of", lambda scene, load_steps: linear_forward(scene)
+        "calibrate.project.problem.simulator_of", lambda scene, *_: linear_forward(scene)
     )
     word = {"kind": "correlated", "length": 500.0, "sd": 1e-9, "spatial_sd": 1.0}
     observe, noisy = make_data(run_of(noise={"displacement": word}), beam)

@@ -32,6 +32,7 @@ def test_names_and_options():
         "rounds",
         "fem",
         *OF_SPECIMENS,
+        "rows",
     ]
     assert full_options("corrected", {}) == {"steps": 1}
     assert full_options("reduced", {"fem_runs": 7}) == {"fem_runs": 7}
@@ -80,7 +81,7 @@ def test_every_kind_builds_a_map_with_its_name_and_its_own_fingerprint():
     simulator = em.Simulator(scene)
     made_of = Ingredients(scene, simulator)
     few = {"reduced": {"fem_runs": 3}}
-    kinds = [name for name in FORWARD_MAPS if name not in (*OF_SPECIMENS, "rounds")]
+    kinds = [name for name in FORWARD_MAPS if name not in (*OF_SPECIMENS, "rounds", "rows")]
     maps = {name: build_forward(name, made_of, few.get(name, {})) for name in kinds}
     for name, forward in maps.items():
         assert forward.kind == name

@@ -160,8 +160,10 @@ def many_solves[T, R](
     solve : the function of a task; what it holds of the simulator is sent to a worker once.
     alone : the number of tasks that come before the others, which use what they compile.
     """
-    if simulator.engine is not None:
-        return simulator.engine.in_order(solve, tasks, alone=alone)
+    engine = getattr(simulator, "engine", None)  # a simulator of another class may have none
+    if engine is not None:
+        results: Iterator[R] = engine.in_order(solve, tasks, alone=alone)
+        return results
     return in_order(solve, tasks, at_once(simulator), alone=alone)
 
 
