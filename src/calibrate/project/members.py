@@ -8,7 +8,7 @@ hierarchy of them all (:func:`calibrate.population.read_hierarchy`).
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -44,7 +44,7 @@ from calibrate.samplers.auto import AUTO
 from calibrate.samplers.nuts import NUTS
 from calibrate.statistical_model import Model
 from emulator.core import schema
-from emulator.core.engine import engine_of
+from emulator.core.engine import Engine, engine_of
 from emulator.core.errors import InputError, SolverError
 from emulator.core.store import read_json, write_json
 
@@ -154,25 +154,8 @@ def infer_members(
         for name in (REPORT, POSTERIOR):
             (folder / name).unlink(missing_ok=True)
         _write_plan(folder, plan)
-        posteriors = dict[str, Posterior]()
-        verdicts = {name: f"{FAILED}: {why}" for name, why in plan.unread.items()}
-        calibrate = _Calibration(plan, folder, certify, force, tolerant, progress=progress)
-        engine, names = engine_of(executor), iter(plan.members)
-        if engine is not None:  # whose workers each have a process, and so all of a run's threads
-            calibrate = replace(calibrate, progress=False, here=False)
-        done = (
-            map(calibrate, names)
-            if engine is None
-            else engine.in_order(calibrate, names, alone=0, ahead=len(plan.members))
-        )
-        for name, (posterior, verdict) in zip(plan.members, done, strict=True):
-            if verdict is not None:
-                verdicts[name] = verdict
-            if verdict is None or not verdict.startswith(FAILED):
-                at = folder / MEMBERS / name
-                posteriors[name] = read_posterior(at)[1] if posterior is None else posterior
-            if engine is not None and progress:
-                tqdm.write(f"{name}: {verdict or 'done'}", file=sys.stderr)
+        calibration = _Calibration(plan, folder, certify, force, tolerant, progress=progress)
+        posteriors, verdicts = _calibrated(calibration, engine_of(executor))
         plan = _of_members_left(plan, posteriors, verdicts)
         _write_plan(folder, plan, {n: v for n, v in verdicts.items() if n not in posteriors})
         hierarchy = _sample_together(plan, posteriors, folder / SAMPLING, progress=progress)
@@ -278,6 +261,29 @@ class _Calibration:
                 raise
             return None, f"{FAILED}: {error}"
         return posterior if self.here else None, verdict if self.certify else None
+
+
+def _calibrated(
+    calibration: _Calibration, engine: Engine | None
+) -> tuple[dict[str, Posterior], dict[str, str]]:
+    """Return the posteriors of all members that did not fail, and the verdicts, by name."""
+    plan, posteriors = calibration.plan, dict[str, Posterior]()
+    verdicts = {name: f"{FAILED}: {why}" for name, why in plan.unread.items()}
+    names, tells = iter(plan.members), engine is not None and calibration.progress
+    if engine is None:
+        done: Iterator[Any] = map(calibration, names)
+    else:  # whose workers each have a process, and so all of a run's threads
+        apart = replace(calibration, progress=False, here=False)
+        done = engine.in_order(apart, names, alone=0, ahead=len(plan.members))
+    for name, (posterior, verdict) in zip(plan.members, done, strict=True):
+        if verdict is not None:
+            verdicts[name] = verdict
+        if verdict is None or not verdict.startswith(FAILED):
+            at = calibration.folder / MEMBERS / name
+            posteriors[name] = read_posterior(at)[1] if posterior is None else posterior
+        if tells:
+            tqdm.write(f"{name}: {verdict or 'done'}", file=sys.stderr)
+    return posteriors, verdicts
 
 
 def _posterior_of(problem: Problem, folder: Path, force: bool, progress: bool) -> Posterior:
