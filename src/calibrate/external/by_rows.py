@@ -36,7 +36,7 @@ from calibrate.posterior import Posterior
 from calibrate.project.problem import Problem
 from calibrate.statistical_model.predictive import Predictive
 from emulator.core.errors import InputError
-from emulator.external.rows import RowsMap, process_in
+from emulator.external.rows import RowsMap, process_in, samples_of
 from emulator.surrogates.correction import no_correction
 from emulator.surrogates.discrepancy import maximin_subset
 
@@ -49,17 +49,15 @@ _NORMAL_90 = 1.6449
 
 def with_emulator_noise(problem: Problem) -> Problem:
     """Return the problem of a table with the emulator's error in the noise of each observation."""
-    process, scene = process_in(problem.scene), problem.scene
+    process, noises = process_in(problem.scene), problem.run.noise
     errors = np.quantile(np.abs(process.left_out), 0.9, axis=0) / _NORMAL_90
-    noises = problem.run.noise
     assert isinstance(noises, Mapping)
     widened = dict(noises)
-    for name, sd in noises.items():
-        part = next(p for n, p in problem.observe.parts.items() if n.partition("@")[0] == name
-                    or n == name)  # fmt: skip
+    for name, (source, sd) in problem.observe.expand(noises, "noise").items():
         if isinstance(sd, int | float):
-            widened[name] = float(np.hypot(sd, np.sqrt(np.mean(errors[part.nodes] ** 2))))
-    return replace(problem, run=replace(problem.run, noise=widened), scene=scene)
+            of_emulator = np.sqrt(np.mean(errors[problem.observe.parts[name].nodes] ** 2))
+            widened[source] = float(np.hypot(sd, of_emulator))
+    return replace(problem, run=replace(problem.run, noise=widened))
 
 
 class _Moves(NamedTuple):
@@ -85,7 +83,7 @@ def examine_rows(posterior: Posterior, folder: Path | None = None, seed: int = 0
     count = len(next(iter(every.values())))
     rows = rng.choice(count, size=min(_DRAWS, count), replace=False)
     draws = {name: values[rows] for name, values in every.items()}
-    thetas = np.stack([np.asarray(model.states.thetas(_one(draws, k))) for k in range(len(rows))])
+    thetas = np.asarray(model.states.thetas(draws))
     moves, sds = _moves(posterior, full, draws, thetas, rng)
     names = model.names
     shift = {n: _figure(moves.means[:, k]) for k, n in enumerate(names)}
@@ -116,14 +114,11 @@ def examine_rows(posterior: Posterior, folder: Path | None = None, seed: int = 0
     return replace(certificate, findings=tuple(findings))
 
 
-def _one(draws: Mapping[str, np.ndarray], k: int) -> dict[str, float]:
-    return {name: float(values[k]) for name, values in draws.items()}
-
-
 def _basis(full: RowsMap) -> str:
-    process = full.process
+    rows = samples_of(full.scene)
     return (
-        f"by {len(process.at)} rows, no run was made: it holds if the solver is as smooth where "
+        f"by {len(rows.theta)} rows ({rows.failed} without an output and {rows.repeated} that are "
+        "there before are left out), no run was made: it holds if the solver is as smooth where "
         "the posterior is as at rows that were left out"
     )
 
@@ -146,9 +141,8 @@ def _moves(
     points = thetas.reshape(-1, thetas.shape[-1])
     errors, sds = full.drawn_errors(points, nodes, _FUNCTIONS, rng)  # (f, a, k), (a, k)
     errors = errors.reshape(len(errors), *thetas.shape[:2], -1)
-    u = np.zeros((*thetas.shape[:2], len(nodes), 3))
     predicted = jax.jit(jax.vmap(full.at(nodes)))(jnp.asarray(points))
-    u[...] = np.asarray(predicted).reshape(u.shape)
+    u = predicted.reshape(*thetas.shape[:2], len(nodes), 3)
 
     @jax.jit
     def likelihood(u: jax.Array, thetas: jax.Array, draw: Any, added: jax.Array) -> jax.Array:

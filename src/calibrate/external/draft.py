@@ -18,7 +18,7 @@ _LOG = 10.0  # ratio of the ends of a range from which its scale may be logarith
 
 
 class TableDraft(NamedTuple):
-    """What was written: the file, the names of parameters and outputs, and notes on both."""
+    """The file that was written, the names of parameters and outputs, and notes on both."""
 
     path: Path
     parameters: list[str]

@@ -64,8 +64,7 @@ def infer(
     force : replace the results of an earlier run in ``folder``.
     check_map : whether a few Newton steps tell how far the forward map is from what is observed;
         a certificate says so, too, and better.
-    executor : the executor of :mod:`concurrent.futures` that does many FEM solves
-        (:mod:`emulator.core.engine`); by default the run's ``engine``.
+    executor : the executor that does FEM (:mod:`emulator.core.engine`), or the run's ``engine``.
     deadline : the value of ``time.perf_counter`` by which rounds of FEM runs that teach a map end,
         whether or not they foresee FEM.
 
@@ -146,6 +145,7 @@ def certify_and_keep(
         (examine_rows,) = offered("calibrate.external.by_rows", "examine_rows")
         of_rows: Certificate = examine_rows(posterior, Path(folder))
         write_json(Path(folder) / CERTIFICATE, of_rows.to_json())
+        remove_pages(Path(folder).resolve())
         return of_rows
     with stages("simulator"):
         simulator = simulator_of(scene, load_steps, executor)

@@ -49,10 +49,8 @@ from emulator.core.errors import InputError, SolverError
 from emulator.core.store import read_json, write_json
 
 SHRINKAGE = "shrinkage.png"
-GROUPS, FAILED = (
-    "groups",
-    "failed",
-)  # entries of a population's run.json; the latter begins verdicts
+GROUPS = "groups"  # entry of a population's run.json
+FAILED = "failed"  # entry of a population's run.json, and beginning of a verdict
 _SAME_MODEL = (
     "scene_fingerprint", "forward_fingerprint", "forward_error", "observe", "noise", "prior",
     "prior_dependence", "load_states",

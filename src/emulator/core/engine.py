@@ -15,11 +15,13 @@ from __future__ import annotations
 import hashlib
 import io
 import multiprocessing
+import os
 import pickle
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, lru_cache
 from types import MappingProxyType
@@ -81,16 +83,16 @@ class Engine:
                 yield self._first(pending, sender)
         finally:
             for sent in pending:
-                if sent.future is not None:
-                    sent.future.cancel()
+                getattr(sent.future, "cancel", bool)()  # which a future need not have
 
     def _first(self, pending: deque[_Sent], sender: _Sender) -> Any:
         """Return the result of the first task, which is sent again until it has one."""
         while True:
             self._submit(pending, sender)
             sent = pending[0]
+            assert sent.future is not None
             try:
-                answer = None if sent.future is None else sent.future.result()
+                answer = sent.future.result()
             except BrokenExecutor as error:
                 self._renew(pending, error)
                 continue
@@ -145,7 +147,7 @@ class _Sent:
 
     @property
     def is_lost(self) -> bool:
-        """Whether it was submitted and has no result, or ended with its executor."""
+        """Say whether it was submitted and has no result, or ended with its executor."""
         future = self.future
         return future is not None and (not future.done() or future.exception() is not None)
 
@@ -154,6 +156,10 @@ class _Lacking(NamedTuple):
     """The answer of a worker that lacks an object, by its digest."""
 
     digest: str
+
+
+class _AbsentError(Exception):
+    """A worker was not sent an object."""
 
 
 class _Sender:
@@ -184,7 +190,7 @@ class _Sender:
     def submitted(self, executor: Executor, sent: _Sent) -> Future[Any]:
         """Return the future of one task."""
         objects = self._objects if sent.with_objects else {}
-        return executor.submit(_work, self._function, sent.task, objects, self._cache)
+        return executor.submit(_work, self._function, sent.task, objects, self._cache, os.getpid())
 
 
 class _Pickler(pickle.Pickler):
@@ -231,27 +237,32 @@ class _Unpickler(pickle.Unpickler):
         self._sent = objects
 
     def persistent_load(self, digest: str) -> Any:
-        """Return the object of ``digest``; ``KeyError`` where this worker was not sent it."""
+        """Return the object of ``digest``, which this worker was sent, now or before."""
         slot = _slot(digest)
         if not slot:
+            if digest not in self._sent:
+                raise _AbsentError(digest)
             slot.append(_Unpickler(self._sent[digest], self._sent).load())
         return slot[0]
 
 
-def _work(function: str, task: bytes, objects: Mapping[str, bytes], folder: str | None) -> Any:
+def _work(
+    function: str, task: bytes, objects: Mapping[str, bytes], folder: str | None, asker: int
+) -> Any:
     """Return the function's result for one task, or which objects it lacks.
 
     function : its digest.
     folder : the folder of compiled programs, shared with the process that asks.
+    asker : the number of that process, whose threads do not set the threads of its BLAS.
     """
     if folder is not None and jax.config.jax_compilation_cache_dir != folder:
         jax.config.update("jax_compilation_cache_dir", folder)
     try:
         unpickler = _Unpickler(task, objects)
         call, argument = unpickler.persistent_load(function), unpickler.load()
-    except KeyError as digest:
+    except _AbsentError as digest:
         return _Lacking(str(digest))
-    with one_blas_thread():
+    with nullcontext() if os.getpid() == asker else one_blas_thread():
         return jax.block_until_ready(call(argument))
 
 

@@ -28,7 +28,6 @@ from typing import Any
 import numpy as np
 
 from emulator.core.errors import InputError, SolverError
-from emulator.core.machine import cores
 from emulator.core.store import write_json
 from emulator.external.problem import ExternalProblem, Output, RunAnswer
 
@@ -58,7 +57,7 @@ class Command:
     files: tuple[str, ...] = ()
     time_limit: float = 3600.0
     runs: str = ""
-    at_once: int = cores()
+    at_once: int | None = None
 
     kind = "command"
 

@@ -32,7 +32,7 @@ _NAME = re.compile(r"[A-Za-z_]\w*")
 
 @dataclass(frozen=True)
 class Output:
-    """What a solver returns under one name.
+    """A part of what a solver returns, under one name.
 
     Parameters
     ----------
@@ -92,13 +92,14 @@ class ExternalSolver(Protocol):
     """A way to ask a solver. Each kind is a frozen dataclass; its fields are keys of ``[solver]``.
 
     kind : its name in files.
-    at_once : the number of runs at the same time, in threads; 1 where they share this process.
+    at_once : the number of runs at the same time, in threads; 1 where they share this process, None
+        for as many as there are cores.
     """
 
     kind: ClassVar[str]
 
     @property
-    def at_once(self) -> int: ...  # noqa: D102
+    def at_once(self) -> int | None: ...  # noqa: D102
 
     def run(self, problem: ExternalProblem, theta: np.ndarray) -> RunAnswer:
         """Return the answer at ``theta`` (p,).
@@ -162,7 +163,7 @@ class ExternalProblem(ForwardProblem):
 
     @property
     def has_solver(self) -> bool:
-        """Whether there is more than a table of runs that somebody made."""
+        """Say whether there is more than a table of runs that somebody made."""
         return not hasattr(self.solver, "usual_map")
 
     @property

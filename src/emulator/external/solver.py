@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -14,6 +15,7 @@ from tqdm import tqdm
 
 from emulator.core.engine import STAYS, Engine, engine_of
 from emulator.core.errors import SolverError
+from emulator.core.machine import cores
 from emulator.external.problem import ExternalProblem, RunAnswer
 from emulator.fem.solution import Solution, Status
 
@@ -34,25 +36,23 @@ class ExternalSimulator:
     @cached_property
     def engine(self) -> Engine | None:
         """The engine that does many runs: the executor, or threads that wait for processes."""
-        workers = self.scene.solver.at_once
+        workers = self.scene.solver.at_once or cores()
         engine = engine_of(self.executor)
         if engine is None and workers > 1:
             return Engine(ThreadPoolExecutor(workers), workers)
         return engine
 
     @cached_property
-    def _answers(self) -> dict[bytes, RunAnswer]:
-        return {}
+    def _last(self) -> threading.local:
+        return threading.local()
 
     def _answer(self, theta: np.ndarray) -> RunAnswer:
-        """Return the answer at ``theta`` (p,), the last of which is kept for its derivatives."""
-        key = theta.tobytes()
-        if key not in self._answers:
+        """Return the answer at ``theta`` (p,); a thread keeps its last one, for its derivatives."""
+        key, answer = getattr(self._last, "answer", (b"", None))
+        if answer is None or key != theta.tobytes():
             answer = self.scene.solver.run(self.scene, theta)
-            self._answers.clear()
-            self._answers[key] = answer
-            return answer
-        return self._answers[key]
+            self._last.answer = theta.tobytes(), answer
+        return answer
 
     def solve(self, theta: jax.Array, start: jax.Array | None = None) -> Solution:  # noqa: ARG002
         """Return the outputs at ``theta`` (p,), (n, 3) in the first column; there is no start."""

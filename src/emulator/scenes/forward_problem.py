@@ -68,7 +68,7 @@ class ForwardProblem(TableRepr):
 
     @property
     def has_solver(self) -> bool:
-        """Whether there is more than a table of runs that somebody made."""
+        """Say whether there is more than a table of runs that somebody made."""
         return True
 
     @property

@@ -110,7 +110,7 @@ class TaughtEmulator(CachedEmulator):
 
     @property
     def record(self) -> Mapping[str, Any]:
-        """What is told of the rounds."""
+        """Return what is told of the rounds."""
         return self.emulator.record
 
     def data_of(self, question: str) -> DataProcess | None:

@@ -11,6 +11,7 @@ from calibrate.project import read_posterior
 from calibrate.project.cohort import read_cohort
 from calibrate.project.members import read_members
 from cli_support import answer, complaint
+from emulator.catalogue import find_problem
 from emulator.core.errors import InputError
 
 STRETCHES = np.linspace(1.02, 1.3, 8)
@@ -56,6 +57,18 @@ def test_priors_that_follow_from_the_data_are_one_for_all(cohort):
     medians = [run.prior["median"] for run in plan.members.values()]
     assert medians[0] == medians[1] == medians[2]
     assert 1.0 < medians[0]["mu"] < 7.0  # of slopes at rest, of three subjects
+
+
+def test_the_prior_of_all_has_the_moments_of_all_subjects_priors(cohort):
+    plan, _ = read_members(cohort)
+    common = next(iter(plan.members.values())).prior
+    rng, logs = np.random.default_rng(0), []
+    for name in "abc":
+        scene = find_problem(str(cohort / "drafts" / f"{name}_scene.toml"))
+        prior = next(p.prior for p in scene.parameters if p.name == "mu")
+        logs.append(np.log(prior.median) + prior.log_sd * rng.normal(size=100_000))
+    assert np.log(common["median"]["mu"]) == pytest.approx(np.mean(logs), abs=0.01)
+    assert common["log_sd"]["mu"] == pytest.approx(np.std(logs), rel=0.01)
 
 
 def test_the_same_command_goes_on_where_it_stopped(cohort, capsys):

@@ -28,7 +28,7 @@ class Bare:
     def submit(self, function, *arguments):
         """Return the future of one call."""
         future = self._pool.submit(function, *arguments)
-        return type("BareFuture", (), {"result": lambda _: future.result(), "cancel": bool})()
+        return type("BareFuture", (), {"result": lambda _: future.result()})()
 
 
 def die_once(path):
@@ -70,6 +70,28 @@ def test_results_come_in_the_order_of_the_tasks_and_few_are_begun_early():
     assert [next(results), len(taken)] == [0, 1]  # the first one is alone
     assert [next(results), len(taken)] == [-1, 4]
     assert list(results) == [-2, -3, -4, -5, -6, -7, -8]
+
+
+def test_what_is_pending_may_be_left_by_futures_without_cancel():
+    results = Engine(Bare(), 2).in_order(neg, iter(range(9)))
+    assert [next(results), next(results)] == [0, -1]
+    results.close()
+
+
+def test_an_object_that_a_worker_cannot_build_is_an_error_and_no_endless_question():
+    with pytest.raises(KeyError, match="no such thing"):
+        list(Engine(ThreadPoolExecutor(1), 1).in_order(Unbuilt(), iter([0])))
+
+
+class Unbuilt:
+    """A function that is refused where it is unpickled."""
+
+    def __reduce__(self):
+        return _refuse_key, ()
+
+
+def _refuse_key():
+    raise KeyError("no such thing")
 
 
 def test_tasks_of_a_worker_that_is_killed_are_done_again_and_named(tmp_path, capsys):

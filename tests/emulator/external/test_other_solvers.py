@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal, norm
 
 import calibrate as cal
 import emulator as em
@@ -167,6 +168,23 @@ def test_an_error_at_a_row_left_out_is_that_of_a_process_of_the_others():
     k = np.asarray(_kernel(whole.logs[0], x[7:8], x[others]))[0]
     direct = y[7] - k @ np.linalg.solve(K[np.ix_(others, others)], y[others])
     assert whole.left_out[7, 0] == pytest.approx(direct * whole.sd[0], rel=1e-6)
+
+
+def test_the_fit_is_that_of_the_density_of_the_rows_and_of_the_lengths():
+    from emulator.external.rows import _covariance, _loss
+
+    x, y = runs(12)[:, :2], runs(12)[:, 2]
+    x, y = (x - x.mean(axis=0)) / x.std(axis=0), (y - y.mean()) / y.std()
+
+    def direct(logs):
+        K = np.asarray(_covariance(logs, x))
+        a2 = y @ np.linalg.solve(K, y) / len(y)  # its most likely value
+        density = multivariate_normal(np.zeros(len(y)), a2 * K).logpdf(y)
+        return density + norm(1.5 + 0.5 * np.log(2.0), 1.0).logpdf(logs[:2]).sum()
+
+    one, other = np.array([0.3, 1.0, -2.0, -6.0]), np.array([1.5, 2.5, 0.5, -4.0])
+    change = (float(_loss(one, x, y)[0]) - float(_loss(other, x, y)[0])) * len(y)
+    assert change == pytest.approx(direct(other) - direct(one), rel=1e-8)
 
 
 def test_failed_and_repeated_rows_are_left_out(tmp_path):
