@@ -13,6 +13,7 @@ import csv
 import tempfile
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -87,7 +88,7 @@ def case(x: np.ndarray, y: np.ndarray, posteriors: int) -> Case:
         begin = perf_counter()
         posterior = cal.infer(cal.read_experiment(path))
         seconds = perf_counter() - begin
-        full = posterior.model.full
+        full: Any = posterior.model.full  # a process of rows, which knows its errors
         predicted = np.asarray(jax.vmap(full)(jnp.asarray(x[apart])))[..., 0]
         _, sds = full.drawn_errors(x[apart], np.arange(y.shape[1]), 1, rng)
         found = [posterior.draws()]
