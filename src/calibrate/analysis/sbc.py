@@ -19,8 +19,9 @@ probability c covers the truth where :math:`|u - 1/2| < c / 2`.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Executor
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -32,7 +33,9 @@ from calibrate.posterior import predictions
 from calibrate.posterior.posterior import sample
 from calibrate.statistical_model import Model
 from emulator.core.display import counting
+from emulator.core.engine import engine_of
 from emulator.core.errors import InputError, check_seed
+from emulator.fem.campaign import in_order
 
 LOG_LIKELIHOOD = "log likelihood"
 """Name of the quantity that depends on the data."""
@@ -181,7 +184,8 @@ def _check_count(replicates: int) -> None:
         raise InputError(f"calibration: {replicates} replicates; give {_FEWEST} or more")
 
 
-Sample = Callable[[dict[str, np.ndarray], int], Mapping[str, np.ndarray]]
+Draw = Mapping[str, np.ndarray]
+Sample = Callable[[Draw, int], Draw]
 """Data by observation and a seed to posterior draws (s,) by the model's names, independent."""
 
 
@@ -196,6 +200,7 @@ def sbc(
     seed: int = 0,
     progress: bool = False,
     draw: Sample | None = None,
+    executor: Executor | str | None = None,
 ) -> Calibration:
     """Return the simulation-based calibration of ``model``, its forward map and a sampler.
 
@@ -206,6 +211,9 @@ def sbc(
     draws : the number of draws of each posterior that are ranked, evenly spaced along the chains,
         because draws that depend on each other make the ranks too even or too extreme.
     draw : the function that draws from a posterior instead of a sampler.
+    executor : the executor of :mod:`concurrent.futures`, or the words of an engine, by which
+        data sets are calibrated at the same time (:mod:`emulator.core.engine`); by default one is
+        after the other, and each has all cores.
 
     Raises
     ------
@@ -221,33 +229,62 @@ def sbc(
             f"{', '.join(truth.names)} instead of {', '.join(model.names)}"
         )
 
-    def sampled(data: dict[str, np.ndarray], number: int) -> Mapping[str, np.ndarray]:
-        posterior = sample(
-            model, data, sampler=sampler, options=options, seed=number, predictions=False
-        )
-        every = posterior.draws()
-        rows = np.linspace(0, len(every[model.names[0]]) - 1, draws).astype(int)
-        return {name: values[rows] for name, values in every.items()}
-
     data_sets = predictions.prior_replicates(truth, jax.random.key(seed), replicates)
     if (count := len(data_sets.draws[truth.names[0]])) < _FEWEST:
         raise InputError(f"calibration: {predictions.shortfall(count, replicates)[0]}")
-    ranks = _replicates(model, data_sets, draw or sampled, seed, progress=progress)
+    drawn = draw or partial(_sampled, model, draws=draws, sampler=sampler, options=options)
+    ranks = _replicates(_Calibrating(model, drawn), data_sets, seed, executor, progress)
     return calibration_of(ranks, seed)
 
 
-def _replicates(
-    model: Model, data_sets: predictions.Prior, draw: Sample, seed: int, *, progress: bool
-) -> Iterator[Replicate]:
-    rows = range(len(next(iter(data_sets.draws.values()))))
-    for r in counting(rows, "calibration", disable=not progress, unit="data set"):
-        data = {name: values[r] for name, values in data_sets.data.items()}
-        true = {name: values[r] for name, values in data_sets.draws.items()}
-        draws = draw(data, seed + 1 + r)  # the data sets are drawn from ``seed``
-        yield Replicate(
-            {**true, LOG_LIKELIHOOD: _log_likelihoods(model, true, data)},
-            {**draws, LOG_LIKELIHOOD: _log_likelihoods(model, draws, data)},
+@dataclass(frozen=True)
+class _Calibrating:
+    """Calibrates one data set, in this process or in a worker's.
+
+    draw : the function that draws from a posterior of ``model``.
+    """
+
+    model: Model
+    draw: Sample
+
+    def __call__(self, task: tuple[Draw, Draw, int]) -> Replicate:
+        """Return a truth and draws, of the data it has made, the truth, and a seed."""
+        data, truth, seed = task
+        draws = self.draw(data, seed)
+        return Replicate(
+            {**truth, LOG_LIKELIHOOD: _log_likelihoods(self.model, truth, data)},
+            {**draws, LOG_LIKELIHOOD: _log_likelihoods(self.model, draws, data)},
         )
+
+
+def _sampled(
+    model: Model, data: Draw, seed: int, *, draws: int, sampler: str | None, options: Any
+) -> Draw:
+    """Return draws (s,) of a posterior by its unknowns, evenly spaced along the chains."""
+    posterior = sample(model, data, sampler=sampler, options=options, seed=seed, predictions=False)
+    every = posterior.draws()
+    rows = np.linspace(0, len(every[model.names[0]]) - 1, draws).astype(int)
+    return {name: values[rows] for name, values in every.items()}
+
+
+def _replicates(
+    calibrating: _Calibrating,
+    data_sets: predictions.Prior,
+    seed: int,
+    executor: Executor | str | None,
+    progress: bool,
+) -> Iterator[Replicate]:
+    count = len(next(iter(data_sets.draws.values())))
+
+    def task(r: int) -> tuple[Draw, Draw, int]:
+        data, truth = (
+            {name: values[r] for name, values in of.items()}
+            for of in (data_sets.data, data_sets.draws)
+        )
+        return data, truth, seed + 1 + r  # the data sets are drawn from ``seed``
+
+    done = in_order(calibrating, map(task, range(count)), 1, engine=engine_of(executor))
+    yield from counting(done, "calibration", total=count, disable=not progress, unit="data set")
 
 
 def _log_likelihoods(

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -32,11 +32,12 @@ from calibrate.certificate.evidence import (
     all_within,
 )
 from calibrate.certificate.runs import FEMRuns
-from calibrate.statistical_model.finer_fem import FinerFEM, MeshPair, finer_fem
+from calibrate.statistical_model.finer_fem import FinerFEM, Known, MeshPair, finer_fem
 from calibrate.statistical_model.pool import Pool
 from calibrate.statistical_model.predictive import Predictive
 from emulator.accuracy.mesh_error import MeshErrorEstimate
 from emulator.core.display import counting
+from emulator.core.engine import Engine
 from emulator.core.errors import InputError, SolverError
 from emulator.core.rooms import offered
 from emulator.fem import Simulator
@@ -119,7 +120,8 @@ def mesh_change(
     with counting(
         total=points[1] * states, desc="finer mesh", disable=not progress, unit="solve"
     ) as bar:
-        differences = _differences_of_fem(predictive, finer, bar)
+        engine = getattr(simulator, "engine", None)
+        differences = _differences_of_fem(predictive, finer, engine, bar)
         change = change_by(differences, pool, runs, points, rng, deadline=deadline)
     finer.forget()
     return replace(
@@ -132,31 +134,44 @@ def mesh_change(
     )
 
 
-def _differences_of_fem(predictive: Predictive, finer: FinerFEM, bar: tqdm) -> Differences:
+def _differences_of_fem(
+    predictive: Predictive, finer: FinerFEM, engine: Engine | None, bar: tqdm
+) -> Differences:
     """Return FEM's differences; each point starts from the finer solutions of earlier ones.
 
     Points that are solved at once start from the first point's, and from those of earlier calls,
     never from what another thread may or may not have finished.
     """
-    known: list[MeshErrorEstimate] = []
-
-    def difference(draw: Mapping[str, Any]) -> MeshPair | None:
-        try:
-            return finer(draw, known)
-        except SolverError:
-            return None
+    known, difference = list[MeshErrorEstimate](), _DifferenceOfFEM(finer)
+    together = finer.workers > 1
 
     def differences(z: np.ndarray) -> Iterator[np.ndarray | None]:
         draws, later = predictive.constrain(z), list[MeshErrorEstimate]()
-        points = ({name: values[k] for name, values in draws.items()} for k in range(len(z)))
-        for number, pair in enumerate(in_order(difference, points, finer.workers)):
+        points = (({n: values[k] for n, values in draws.items()}, known) for k in range(len(z)))
+        pairs = in_order(difference, points, finer.workers, engine=engine if together else None)
+        for number, pair in enumerate(pairs):
             if pair is not None:  # the first point is solved alone
-                (later if number and finer.workers > 1 else known).extend(pair.estimates)
+                (later if number and together else known).extend(pair.estimates)
             bar.update(len(predictive.model.states.states))
             yield None if pair is None else pair.fine - pair.coarse
         known.extend(later)
 
     return differences
+
+
+@dataclass(frozen=True)
+class _DifferenceOfFEM:
+    """Solves at one point, in this process or in a worker's."""
+
+    finer: FinerFEM
+
+    def __call__(self, task: tuple[Mapping[str, Any], Known]) -> MeshPair | None:
+        """Return the data at a draw, from the known solutions; None where FEM fails."""
+        draw, known = task
+        try:
+            return self.finer(draw, known)
+        except SolverError:
+            return None
 
 
 def change_by(

@@ -248,8 +248,8 @@ def build_model(
     return run_model, data
 
 
-def by_fem(model: Model, load_steps: int = 1) -> Model:
+def by_fem(model: Model, load_steps: int = 1, executor: Executor | str = "threads") -> Model:
     """Return ``model`` with FEM as its forward map, to make data for checks of the model."""
-    whole = by_solver(simulator_of(model.forward.scene, load_steps), model.full)
+    whole = by_solver(simulator_of(model.forward.scene, load_steps, executor), model.full)
     forward = whole.at(model.observe.nodes)
     return replace(model, full=whole, forward=forward)

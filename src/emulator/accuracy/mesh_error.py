@@ -38,6 +38,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.accuracy.estimate import Distance, newton_distance
+from emulator.core.engine import STAYS
 from emulator.core.errors import InputError
 from emulator.core.gaussian_process import Regression
 from emulator.fem.compiled import compiled
@@ -101,7 +102,7 @@ class MeshError:
     simulator: Simulator
     finer: Finer
     fine: Simulator
-    _alone: Lock = field(default_factory=Lock, repr=False)
+    _alone: Lock = field(default_factory=Lock, repr=False, metadata={STAYS: True})
 
     def __call__(
         self,

@@ -27,6 +27,7 @@ from functools import cache, lru_cache
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+import cloudpickle
 import jax
 from tqdm import tqdm
 
@@ -193,10 +194,10 @@ class _Sender:
         return executor.submit(_work, self._function, sent.task, objects, self._cache, os.getpid())
 
 
-class _Pickler(pickle.Pickler):
+class _Pickler(cloudpickle.Pickler):  # which packs functions inside functions, and a notebook's
     def __init__(self, file: io.BytesIO, digest: Callable[[Any], str | None]) -> None:
         super().__init__(file, protocol=pickle.HIGHEST_PROTOCOL)
-        self.persistent_id = digest  # type: ignore[method-assign]
+        self.persistent_id = digest
 
     def reducer_override(self, thing: Any) -> Any:
         """Make dataclasses of these packages from their fields: not from what they compiled."""
@@ -207,7 +208,7 @@ class _Pickler(pickle.Pickler):
             sent = (f.name for f in fields(thing) if f.init and not f.metadata.get(STAYS))
             values = {name: getattr(thing, name) for name in sent}
             return _made, (type(thing), values)
-        return NotImplemented
+        return super().reducer_override(thing)
 
 
 def _made(kind: Callable[..., Any], values: Mapping[str, Any]) -> Any:

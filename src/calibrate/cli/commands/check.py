@@ -55,7 +55,7 @@ def _sbc(arguments: Namespace) -> Answer:
     if arguments.true_noise:
         truth = model_before_data(problem.change(noise=noise_words(arguments.true_noise)))
     if arguments.fem_data:
-        truth = by_fem(truth, run.load_steps)
+        truth = by_fem(truth, run.load_steps, run.engine)
     options = AutoOptions(arguments.warmup, arguments.draws, arguments.chains, rounds=1)
     calibration = sbc(
         model,
@@ -64,6 +64,7 @@ def _sbc(arguments: Namespace) -> Answer:
         options=options,
         seed=run.seed,
         progress=progress,
+        executor=run.engine,
     )
     result = calibration.to_json()
     write_json(folder / "calibration.json", result)

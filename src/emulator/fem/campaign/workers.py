@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.core.engine import Engine
 from emulator.core.errors import SolverError
 from emulator.core.machine import cores, inherited, memory
 from emulator.fem.assembly import System
@@ -161,22 +162,27 @@ def many_solves[T, R](
     alone : the number of tasks that come before the others, which use what they compile.
     """
     engine = getattr(simulator, "engine", None)  # a simulator of another class may have none
-    if engine is not None:
-        results: Iterator[R] = engine.in_order(solve, tasks, alone=alone)
-        return results
-    return in_order(solve, tasks, at_once(simulator), alone=alone)
+    return in_order(solve, tasks, at_once(simulator), alone=alone, engine=engine)
 
 
 def in_order[T, R](
-    function: Callable[[T], R], tasks: Iterator[T], workers: int, *, alone: int = 1
+    function: Callable[[T], R],
+    tasks: Iterator[T],
+    workers: int,
+    *,
+    alone: int = 1,
+    engine: Engine | None = None,
 ) -> Iterator[R]:
-    """Yield ``function`` of every task, in the order of the tasks, by ``workers`` threads.
+    """Yield ``function`` of every task, in their order, by an engine or by ``workers`` threads.
 
     The first ``alone`` tasks come before the threads, which use what they compile. Then a task is
     taken when all but ``workers`` of the results before it have been yielded. So what a task is
     made of, such as a start from earlier rows, does not depend on which thread was quicker. While
     the threads work, as many factors are kept as there are threads.
     """
+    if engine is not None:
+        yield from engine.in_order(function, tasks, alone=alone)
+        return
     for task in islice(tasks, alone):
         yield function(task)
     if workers == 1:
