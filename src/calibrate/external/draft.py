@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emulator.core.cells import Cells, read_cells
 from emulator.core.errors import InputError
 from emulator.core.units import with_unit
+from emulator.external.tables import RunTable, read_runs
 
 _LOG = 10.0  # ratio of the ends of a range from which its scale may be logarithmic
 
@@ -43,12 +43,14 @@ def draft_of_table(table: Path, out: Path, inputs: Sequence[str]) -> TableDraft:
     """
     if out.exists():
         raise InputError(f"{out} is there already; give another name with --out")
-    cells = read_cells(table)
-    chosen = _chosen(cells, inputs)
+    runs = read_runs(table)
+    chosen = _chosen(runs, inputs)
     notes, parameters, outputs, columns = list[str](), list[str](), list[str](), dict[str, str]()
     blocks = []
     for word in chosen:
-        values = _numbers(cells, word)
+        values = runs.column(word)
+        if values.shape[1] > 1:
+            raise InputError(f"{table}: parameter '{word}' has {values.shape[1]} numbers a row")
         name = _named(word, columns)
         low, high = float(values.min()), float(values.max())
         if low == high:
@@ -57,13 +59,13 @@ def draft_of_table(table: Path, out: Path, inputs: Sequence[str]) -> TableDraft:
             continue
         scale = 'scale = "log"\n' if _is_log(values) else ""
         blocks.append(
-            f"[parameters.{name}]\n{_unit_of(word)}range = [{low:.10g}, {high:.10g}]"
+            f"[parameters.{name}]\n{_unit_line(runs, word)}range = [{low:.10g}, {high:.10g}]"
             f"  # of the rows: the map answers nowhere else\n{scale}"
         )
         parameters.append(name)
-    for word in (w for w in cells.words if w not in chosen):
+    for word in (w for w in runs.sizes if w not in chosen):
         try:
-            values = _numbers(cells, word, gaps=True)
+            values = runs.column(word, gaps=True)
         except InputError:
             notes.append(f"'{word}' has text: left out")
             continue
@@ -72,7 +74,8 @@ def draft_of_table(table: Path, out: Path, inputs: Sequence[str]) -> TableDraft:
             notes.append(f"'{word}' is empty: left out")
             del columns[name]
             continue
-        blocks.append(f"[outputs.{name}]\n{_unit_of(word)}")
+        size = f"size = {values.shape[1]}\n" if values.shape[1] > 1 else ""
+        blocks.append(f"[outputs.{name}]\n{_unit_line(runs, word)}{size}")
         outputs.append(name)
     if not parameters or not outputs:
         raise InputError(f"{table}: no {'outputs' if parameters else 'parameters'}; see --inputs")
@@ -88,15 +91,18 @@ def draft_of_table(table: Path, out: Path, inputs: Sequence[str]) -> TableDraft:
     return TableDraft(out, parameters, outputs, notes)
 
 
-def _chosen(cells: Cells, inputs: Sequence[str]) -> list[str]:
-    if len(inputs) == 1 and inputs[0].isdigit() and inputs[0] not in cells.words:
+def _chosen(runs: RunTable, inputs: Sequence[str]) -> list[str]:
+    words = list(runs.sizes)
+    if len(inputs) == 1 and inputs[0].isdigit() and inputs[0] not in words:
         count = int(inputs[0])
-        if not 0 < count < len(cells.words):
-            raise InputError(f"--inputs {count}: {cells.path} has {len(cells.words)} columns")
-        return list(cells.words[:count])
+        if not 0 < count < len(words):
+            raise InputError(f"--inputs {count}: {runs.path} has {len(words)} columns")
+        if runs.path.is_dir():
+            raise InputError(f"--inputs {count}: arrays of {runs.path} have no order; name them")
+        return words[:count]
     for word in inputs:
-        if word not in cells.words:
-            raise InputError(f"--inputs: {cells.path} has no column '{word}'")
+        if word not in words:
+            raise InputError(f"--inputs: {runs.path} has no column '{word}'")
     return list(inputs)
 
 
@@ -110,10 +116,6 @@ def _is_log(values: np.ndarray) -> bool:
     return bool(abs(shares[0] - 0.5) < abs(shares[1] - 0.5))
 
 
-def _numbers(cells: Cells, word: str, *, gaps: bool = False) -> np.ndarray:
-    return np.array([cells.number(k, word, gaps=gaps) for k in cells.rows])
-
-
 def _named(word: str, columns: dict[str, str]) -> str:
     """Return a name for a column, of letters, digits and _, that no other has; and keep it."""
     name = re.sub(r"\W+", "_", with_unit(word)[0]).strip("_") or "column"
@@ -125,6 +127,6 @@ def _named(word: str, columns: dict[str, str]) -> str:
     return name
 
 
-def _unit_of(word: str) -> str:
-    unit = with_unit(word)[1]
+def _unit_line(runs: RunTable, word: str) -> str:
+    unit = runs.units.get(word)
     return f"unit = {json.dumps(unit)}\n" if unit else ""

@@ -20,7 +20,6 @@ there exceed a Gaussian's at 90 % widens the sd of every output.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -31,7 +30,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.core.cells import read_cells
 from emulator.core.display import counting
 from emulator.core.errors import InputError
 from emulator.core.gaussian_process import Regression
@@ -39,7 +37,8 @@ from emulator.core.kept import kept
 from emulator.core.machine import one_blas_thread
 from emulator.core.minimise import minimise
 from emulator.external.maps import OutputsMap
-from emulator.external.problem import ExternalProblem, RunAnswer
+from emulator.external.problem import ExternalProblem, Output, RunAnswer
+from emulator.external.tables import RunTable, content_of, read_runs
 from emulator.scenes.forward_problem import ForwardProblem
 from emulator.scenes.scene import all_nodes
 from emulator.surrogates.protocol import Arrays, ForwardKind, ForwardMap, fingerprint_of
@@ -50,6 +49,8 @@ _HELD_OUT = 5  # one of so many rows is held out
 _NORMAL_90 = 1.6449  # sds that a Gaussian has 90 % within
 _LOG_LENGTH, _LOG_LENGTH_SD = 1.5, 1.0  # prior of a log length, less half the log of the inputs
 _JITTER = 1e-8
+_MOST_OUTPUTS = 30  # of which each has a process; more are a field, by its modes
+_MOST_MODES, _LEFT = 30, 1e-6  # of a field: their number, and the share of variance beyond them
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ class Rows:
 
     Parameters
     ----------
-    file : the table (CSV or spreadsheet), relative to this file; a row a run.
+    file : the table (CSV, spreadsheet, netCDF or Zarr), relative to this file; a row a run.
     columns : its columns whose name is not that of their parameter or output, by that name.
     """
 
@@ -77,10 +78,13 @@ class Rows:
 
     def identity(self, folder: Path) -> Any:
         """Return the content of the table, and its columns."""
-        path = folder / self.file
-        if not path.is_file():
-            raise InputError(f"file: there is no table {path}")
-        return [hashlib.sha256(path.read_bytes()).hexdigest(), self.columns]
+        return [content_of(_existing(folder / self.file)), self.columns]
+
+
+def _existing(path: Path) -> Path:
+    if not path.exists():
+        raise InputError(f"file: there is no table {path}")
+    return path
 
 
 class TableRuns(NamedTuple):
@@ -106,28 +110,20 @@ def samples_of(problem: ForwardProblem) -> TableRuns:
     """
     if not isinstance(problem, ExternalProblem) or not isinstance(problem.solver, Rows):
         raise InputError(f"problem '{problem.name}' is no table of runs")
-    rows, path = problem.solver, problem.folder / problem.solver.file
-    if not path.is_file():
-        raise InputError(f"file: there is no table {path}")
-    cells = read_cells(path)
-
-    def column(name: str, *, gaps: bool) -> np.ndarray:
-        word = rows.columns.get(name, name)
-        if word not in cells.words:
-            raise InputError(f"{path}: there is no column '{word}', but {', '.join(cells.words)}")
-        return np.array([cells.number(k, word, gaps=gaps) for k in cells.rows])
-
-    theta = np.stack([column(n, gaps=False) for n in problem.parameter_names], axis=1)
+    named, path = problem.solver.columns, _existing(problem.folder / problem.solver.file)
+    table = read_runs(path)
+    theta = np.hstack([table.column(named.get(n, n)) for n in problem.parameter_names])
+    if theta.shape[1] != len(problem.parameters):
+        raise InputError(f"{path}: a parameter has several numbers in a row; give one of each")
     for name, constant in zip(problem.parameter_names, np.ptp(theta, axis=0) == 0.0, strict=True):
         if constant:
             raise InputError(f"{path}: '{name}' is the same in all rows; leave it out")
-    names = [c for output in problem.outputs for c in output.columns]
-    outputs = np.stack([column(name, gaps=True) for name in names], axis=1)
+    outputs = np.hstack([_numbers_of(output, table, named) for output in problem.outputs])
     known = np.isfinite(outputs).all(axis=1)
     _, first, where = np.unique(theta[known], axis=0, return_index=True, return_inverse=True)
     unlike = np.flatnonzero((outputs[known] != outputs[known][first[where]]).any(axis=1))
     if unlike.size:
-        row = np.array(list(cells.rows))[known]
+        row = table.rows[known]
         raise InputError(
             f"{path}: rows {row[first[where[unlike[0]]]]} and {row[unlike[0]]} have the same "
             "parameters and other outputs; a solver that answers at random is not supported"
@@ -140,14 +136,29 @@ def samples_of(problem: ForwardProblem) -> TableRuns:
     return TableRuns(theta[known][once], outputs[known][once], failed, repeated)
 
 
+def _numbers_of(output: Output, table: RunTable, named: Mapping[str, str]) -> np.ndarray:
+    """Return the numbers (c, size) of an output: a field, or a column of each."""
+    whole = named.get(output.name, output.name)
+    if whole not in table.sizes:
+        words = [named.get(column, column) for column in output.columns]
+        return np.hstack([table.column(word, gaps=True) for word in words])
+    if table.sizes[whole] != output.size:
+        raise InputError(
+            f"{table.path}: '{whole}' has {table.sizes[whole]} numbers in a row, and the problem's "
+            f"file says size = {output.size}"
+        )
+    return table.column(whole, gaps=True)
+
+
 class Process(NamedTuple):
-    """A Gaussian process of each of n outputs of c runs, all standardised.
+    """A Gaussian process of each of m modes of the n outputs of c runs, all standardised.
 
     at : the runs' positions (c, p). centre, width : by which positions are standardised, (p,).
     mean, sd : those of the outputs over the runs, (n,).
-    logs : logarithms of lengths, trend and nugget, (n, p + 2).
-    weights : the weights (n, c) of the runs.
-    variance : the variance a^2 of each output, (n,), in squared sds, widened.
+    modes : the modes (m, n) of the standardised outputs. rest : the sd (n,) of what is not in them.
+    logs : logarithms of lengths, trend and nugget, (m, p + 2).
+    weights : the weights (m, c) of the runs.
+    variance : the variance a^2 of each mode, (m,), widened.
     left_out : the error (c, n) at each run by all others, in the output's unit.
     """
 
@@ -156,6 +167,8 @@ class Process(NamedTuple):
     width: np.ndarray
     mean: np.ndarray
     sd: np.ndarray
+    modes: np.ndarray
+    rest: np.ndarray
     logs: np.ndarray
     weights: np.ndarray
     variance: np.ndarray
@@ -165,7 +178,7 @@ class Process(NamedTuple):
         """Return the outputs (n,) at a position ``x`` (p,)."""
         x = (x - self.centre) / self.width
         kernels = jax.vmap(lambda logs: _kernel(logs, x[None], self.at)[0])(self.logs)
-        return self.mean + self.sd * jnp.sum(kernels * self.weights, axis=1)
+        return self.mean + self.sd * (jnp.sum(kernels * self.weights, axis=1) @ self.modes)
 
 
 def _kernel(logs: Any, x: Any, y: Any) -> jax.Array:
@@ -229,21 +242,41 @@ def process_of(
 ) -> Process:
     """Return the process of outputs (c, n) at positions (c, p) in the box.
 
-    progress : called after each of the 2 n fits.
+    progress : called after each of the fits, two for each mode.
     """
     centre, width = positions.mean(axis=0), positions.std(axis=0)
     mean, sd = outputs.mean(axis=0), outputs.std(axis=0)
     constant = np.ptp(outputs, axis=0) == 0.0
     sd = np.where(constant, 1.0, sd)
-    x, y = (positions - centre) / width, (outputs - mean) / sd
+    x, whole = (positions - centre) / width, (outputs - mean) / sd
+    modes = _modes(whole)
+    y = whole @ np.linalg.pinv(modes) if len(modes) < len(mean) else whole
+    missed = whole - y @ modes
     held_out = np.arange(len(x)) % _HELD_OUT == _HELD_OUT - 1
     ratio = _excess(x, y, held_out, progress)
     logs = _every(x, y, _MOST, progress)
     fits = [_fit(h, x, column) for h, column in zip(logs, y.T, strict=True)]
-    left_out = np.stack([f.weights / np.diagonal(f.inverse) for f in fits], axis=1) * sd
+    left_out = np.stack([f.weights / np.diagonal(f.inverse) for f in fits], axis=1) @ modes
+    left_out = (left_out + missed) * sd
     variance = np.array([f.variance for f in fits]) * ratio**2
     weights = np.stack([f.weights for f in fits])
-    return Process(x, centre, width, mean, sd, logs, weights, variance, left_out)
+    rest = missed.std(axis=0)
+    return Process(x, centre, width, mean, sd, modes, rest, logs, weights, variance, left_out)
+
+
+def _modes(outputs: np.ndarray) -> np.ndarray:
+    r"""Return the modes (m, n) of standardised outputs (c, n): each output is one, if they are few.
+
+    Of a field they are its principal components :math:`v_k`, divided by the number of rows' root so
+    that scores have the size of an output's, down to a share of 1e-6 of the variance:
+    :math:`y = \sum_k s_k\, \sigma_k v_k / \sqrt c`, singular values :math:`\sigma_k`.
+    """
+    if outputs.shape[1] <= _MOST_OUTPUTS:
+        return np.eye(outputs.shape[1])
+    _, sizes, vectors = np.linalg.svd(outputs, full_matrices=False)
+    left = 1.0 - np.cumsum(sizes**2) / np.sum(sizes**2)
+    count = min(int(np.searchsorted(-left, -_LEFT)) + 1, _MOST_MODES)
+    return sizes[:count, None] * vectors[:count] / np.sqrt(len(outputs))
 
 
 def _every(x: np.ndarray, y: np.ndarray, most: int, progress: Callable[[], Any]) -> np.ndarray:
@@ -313,18 +346,20 @@ class RowsMap(OutputsMap):
         """
         p = self.process
         x = (np.asarray(self.scene.to_unit(jnp.asarray(theta))) - p.centre) / p.width
-        errors, sds = [], []
-        for k in outputs:
+        modes = p.modes[:, outputs]
+        errors = rng.normal(size=(count, len(x), len(outputs))) * p.rest[outputs]
+        variances = np.tile(p.rest[outputs] ** 2, (len(x), 1))
+        for k in np.flatnonzero(modes.any(axis=1)):
             logs = jnp.asarray(p.logs[k])
             regression = Regression.of(np.asarray(_covariance(logs, p.at)))
             whitened = regression.whitened(np.asarray(_kernel(logs, p.at, x)))
             remaining = np.asarray(_covariance(logs, x)) - whitened.T @ whitened
-            remaining *= p.variance[k] * p.sd[k] ** 2
+            remaining *= p.variance[k]
             values, vectors = np.linalg.eigh(remaining)  # singular where two draws are one
             root = vectors * np.sqrt(np.maximum(values, 0.0))
-            errors.append(rng.normal(size=(count, len(x))) @ root.T)
-            sds.append(np.sqrt(np.maximum(np.diagonal(remaining), 0.0)))
-        return np.stack(errors, axis=-1), np.stack(sds, axis=-1)
+            errors += (rng.normal(size=(count, len(x))) @ root.T)[..., None] * modes[k]
+            variances += np.maximum(np.diagonal(remaining), 0.0)[:, None] * modes[k] ** 2
+        return errors * p.sd[outputs], np.sqrt(variances) * p.sd[outputs]
 
     def arrays(self) -> Arrays:
         """Return all that gives a value, by name."""
@@ -336,8 +371,7 @@ def process_in(problem: ForwardProblem) -> Process:
     """Return the process of a problem's table, which the problem keeps; see :func:`samples_of`."""
     samples = samples_of(problem)
     positions = np.asarray(problem.to_unit(jnp.asarray(samples.theta)))
-    count = 2 * samples.outputs.shape[1]
-    with counting(total=count, desc="fits to the table", unit="fit") as bar:
+    with counting(desc="fits to the table", unit="fit") as bar:
         return process_of(positions, samples.outputs, bar.update)
 
 
