@@ -142,8 +142,8 @@ def _differences_of_fem(
     Points that are solved at once start from the first point's, and from those of earlier calls,
     never from what another thread may or may not have finished.
     """
-    known, difference = list[MeshErrorEstimate](), _DifferenceOfFEM(finer)
-    together = finer.workers > 1
+    known, difference = list[MeshErrorEstimate](), DifferenceOfFEM(finer)
+    together = finer.workers > 1  # else each point starts from the one before it
 
     def differences(z: np.ndarray) -> Iterator[np.ndarray | None]:
         draws, later = predictive.constrain(z), list[MeshErrorEstimate]()
@@ -160,7 +160,7 @@ def _differences_of_fem(
 
 
 @dataclass(frozen=True)
-class _DifferenceOfFEM:
+class DifferenceOfFEM:
     """Solves at one point, in this process or in a worker's."""
 
     finer: FinerFEM

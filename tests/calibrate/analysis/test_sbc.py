@@ -1,5 +1,6 @@
 """Simulation-based calibration passes what is right and fails what is wrong."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -91,6 +92,15 @@ def test_a_wrong_one_fails(beam, forward, truth, wrong):
         outside = found.outside()
         assert outside["mu"] == outside["lam"] == 0.0
         assert outside[LOG_LIKELIHOOD] > 0.1
+
+
+@pytest.mark.parametrize("executor", ["processes:2", ThreadPoolExecutor(2)])
+def test_ranks_are_the_same_by_every_engine(truth, forward, executor):
+    here, there = (
+        sbc(truth, 20, draw=exact(forward), seed=1, executor=where) for where in (None, executor)
+    )
+    for name, ranks in here.ranks.items():
+        assert np.array_equal(ranks, there.ranks[name])
 
 
 def test_false_alarms_are_as_rare_as_they_should_be():

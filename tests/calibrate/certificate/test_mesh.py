@@ -1,5 +1,6 @@
 """What a finer mesh changes of a posterior, where that is known in closed form, and by FEM."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -10,9 +11,11 @@ import calibrate as cal
 import emulator as em
 from calibrate.certificate import examine
 from calibrate.certificate.evidence import Figure, MeshChange
-from calibrate.certificate.mesh import _at_draws, change_by, points_for
+from calibrate.certificate.mesh import DifferenceOfFEM, _at_draws, change_by, points_for
 from calibrate.certificate.verdict import judge
+from calibrate.statistical_model.finer_fem import finer_fem
 from certificate_support import exact_data, exact_posterior, grid_of, linear_model, quadrature
+from emulator.core.engine import Engine
 from emulator.surrogates.correction import fit_correction
 from emulator.surrogates.taylor import expand
 from linear_support import LinearSimulator, linear_forward
@@ -145,6 +148,21 @@ def test_the_verdict_follows_the_mesh(check):
     remedy = "make the elements quadratic (order = 2), or infer on the finer mesh (calibrate infer"
     assert remedy in str(judge(replace(evidence, mesh=linear)))
     assert verdict(0.1).to_json()["mesh"]["shift"] == {"mu": 0.1}
+
+
+def test_a_worker_solves_on_the_finer_mesh_as_this_process_does():
+    scene = em.scenes.once_clamped_beam(cells=(2, 1, 1), order=1)
+    simulator, observe = em.Simulator(scene), cal.nodal_displacements(scene, "right")
+    emulator = em.Emulator(scene, taylor=expand(simulator)).cache()
+    model = cal.model(emulator, observe, cal.GaussianNoise(sd=0.5), check_scale=False)
+    difference = DifferenceOfFEM(finer_fem(model, simulator))
+    tasks = [({"mu": np.array(75.0), "lam": np.array(lam)}, []) for lam in (60.0, 70.0)]
+    engine = Engine(ThreadPoolExecutor(2), 2)
+    here, there = map(difference, tasks), engine.in_order(difference, iter(tasks))
+    for one, other in zip(here, there, strict=True):
+        assert np.array_equal(one.fine, other.fine)
+        assert np.array_equal(one.coarse, other.coarse)
+        assert np.abs(one.fine - one.coarse).max() > 0.1
 
 
 def test_solves_are_counted_in_every_load_state():

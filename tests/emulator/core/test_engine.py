@@ -154,3 +154,24 @@ def test_a_cluster_of_dask_gives_the_same(beam):
         by_dask = run_campaign(em.Simulator(scene, executor=client.get_executor()), thetas)
     by_threads = run_campaign(em.Simulator(scene, executor=Bare()), thetas)
     assert np.array_equal(by_dask.displacement, by_threads.displacement)
+
+
+@pytest.mark.slow
+def test_workers_of_executorlib_give_the_same(beam):
+    executorlib = pytest.importorskip("executorlib")
+    scene, thetas = beam
+    with executorlib.SingleNodeExecutor(max_workers=2, block_allocation=True) as pool:
+        by_workers = run_campaign(em.Simulator(scene, executor=pool), thetas)
+    by_threads = run_campaign(em.Simulator(scene, executor=Bare()), thetas)
+    assert np.array_equal(by_workers.displacement, by_threads.displacement)
+
+
+def test_functions_inside_functions_go_to_a_worker():
+    shift = 3
+
+    def shifted(number):
+        return number + shift
+
+    engine = engine_of(PROCESSES)
+    assert engine is not None
+    assert list(engine.in_order(shifted, iter(range(4)))) == [3, 4, 5, 6]
