@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from emulator.core.errors import InputError, closest
 from emulator.geometry.mesh import Mesh, coincident, find_rows, orient
-from emulator.mechanics.laws import find_law
+from emulator.mechanics.laws import LAWS
 from emulator.neighbours.decks.materials import Material
 from emulator.scenes.loads import Force, Gravity
 from emulator.scenes.loads.force import MN_PER_N
@@ -78,26 +78,27 @@ class DeckFile:
         return InputError(f"deck {self.path}, line {line}: {problem}")
 
     def skip(self, line: int, text: str) -> None:
-        """Keep a line that is not understood; its text is cut."""
-        self.unread.append(Unread(line, " ".join(text.split())[:100]))
+        """Keep a line that is not understood; its text is cut to what a comment may hold."""
+        words = "".join(letter if letter.isprintable() else " " for letter in text).split()
+        self.unread.append(Unread(line, " ".join(words)[:100]))
 
     def note(self, sentence: str) -> None:
         """Keep a sentence, once."""
         if sentence not in self.notes:
             self.notes.append(sentence)
 
-    def numbers(self, words: str | Sequence[str], line: int, count: int | None = None) -> list:
+    def numbers(
+        self, words: str | Sequence[str], line: int, count: int | None = None
+    ) -> list[float]:
         """Return the numbers of a text, which has ``count`` of them where that is not None."""
-        texts = words.replace(",", " ").split() if isinstance(words, str) else words
-        try:
-            values = [float(word) for word in texts]
-        except ValueError:
-            wrong = next(word for word in texts if not _is_number(word))
-            raise self.error(line, f"'{wrong[:40]}' is not a number") from None
-        if count is not None and len(values) != count:
-            raise self.error(line, f"{len(values)} numbers, expected {count}")
-        if not np.isfinite(values).all():
-            raise self.error(line, "a number is not finite")
+        values = []
+        for word in words.replace(",", " ").split() if isinstance(words, str) else words:
+            try:
+                values.append(float(word))
+            except ValueError:
+                raise self.error(line, f"'{word[:40]}' is not a number") from None
+        if count not in (None, len(values)) or not np.isfinite(values).all():
+            raise self.error(line, f"{len(values)} numbers, expected {count or ''} finite ones")
         return values
 
     def keys(self, words: Sequence[str], line: int) -> list[int]:
@@ -107,13 +108,20 @@ class DeckFile:
                 raise self.error(line, f"'{word.strip()[:40]}' is not the number of a node")
         return [int(word) for word in words]
 
+    def unit(self, vector: np.ndarray, line: int) -> np.ndarray:
+        """Return a direction (3,) of length one."""
+        length = float(np.linalg.norm(vector))
+        if length == 0.0:
+            raise self.error(line, "a direction has length zero")
+        return vector / length
+
     def known(self, name: str, sets: Iterable[str], noun: str, line: int) -> str:
         """Return ``name``, which must be one of the deck's sets or materials."""
         names = list(sets)
         if name not in names:
-            others = ", ".join(names) or "none"
+            there = ", ".join(names) or "none"
             hint = closest(name, names)
-            raise self.error(line, f"{noun} '{name}' is not in the deck; it has {others}{hint}")
+            raise self.error(line, f"{noun} '{name}' is not in the deck; it has {there}{hint}")
         return name
 
     def neighbour(self, name: str, line: int) -> Path:
@@ -127,12 +135,26 @@ class DeckFile:
         return path
 
 
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
+def finished(
+    program: str, file: DeckFile, mesh: Mesh, material: Material,
+    prescribed: Mapping[tuple[str, int], float], loads: Iterable[Load],
+    axes: tuple[np.ndarray | None, np.ndarray | None],
+) -> Deck:  # fmt: skip
+    """Return a deck that was read; ``prescribed`` has displacements by node set and component."""
+    values: dict[str, dict[int, float]] = {}
+    for (name, axis), value in prescribed.items():
+        values.setdefault(name, {})[axis] = value
+    supports = tuple(support(name, of_set) for name, of_set in values.items())
+    return Deck(
+        program,
+        mesh,
+        material,
+        supports,
+        tuple(loads),
+        *axes,
+        tuple(file.unread),
+        tuple(file.notes),
+    )
 
 
 def read_text(path: Path) -> str:
@@ -148,18 +170,19 @@ def read_text(path: Path) -> str:
 class Element(NamedTuple):
     """The nodes of a tetrahedron, and its line in the deck."""
 
-    nodes: tuple[Hashable, ...]
+    nodes: tuple[Any, ...]
     line: int
 
 
-Row = tuple[Hashable, ...]
+Row = tuple[Any, ...]
+"""The corners of a facet, and its other nodes, by their numbers in the deck."""
 
 
-def assemble(
+def assemble[K: Hashable](
     file: DeckFile,
-    nodes: Mapping[Hashable, Sequence[float]],
-    elements: Mapping[Hashable, Element],
-    node_sets: Mapping[str, Iterable[Hashable]],
+    nodes: Mapping[K, Sequence[float]],
+    elements: Mapping[K, Element],
+    node_sets: Mapping[str, Iterable[K]],
     facet_sets: Mapping[str, Sequence[Row]],
 ) -> Mesh:
     """Return the mesh; nodes of no element are dropped.
@@ -182,7 +205,7 @@ def assemble(
     used = dict.fromkeys(k for element in elements.values() for k in element.nodes)
     places = {number: k for k, number in enumerate(k for k in nodes if k in used)}
     points = np.array([nodes[k] for k in places], dtype=float)
-    rows = orient(points, [[places[k] for k in e.nodes] for e in elements.values()])
+    rows = orient(points, np.array([[places[k] for k in e.nodes] for e in elements.values()]))
     kept = {name: [places[k] for k in keys if k in places] for name, keys in node_sets.items()}
     try:
         bare = Mesh(points, rows, {name: np.unique(k) for name, k in kept.items() if k})
@@ -205,7 +228,7 @@ def assemble(
 
 
 def _on_surface(
-    mesh: Mesh, name: str, corners: Sequence[Row], places: Mapping[Hashable, int]
+    mesh: Mesh, name: str, corners: Sequence[Row], places: Mapping[Any, int]
 ) -> np.ndarray:
     rows = np.array([[places.get(k, -1) for k in row[:3]] for row in corners], dtype=int)
     hits = find_rows(rows, mesh.surface[:, :3])
@@ -226,53 +249,56 @@ def support(name: str, values: Mapping[int, float]) -> Support:
     return Support(name, np.array([values.get(k, 0.0) for k in range(3)]), components)
 
 
-def weight(body_force: Sequence[float]) -> Gravity | None:
-    """Return the load of a force per volume (3,), stress over length; None for no force."""
+def weight(body_force: Sequence[float] | np.ndarray) -> list[Gravity]:
+    """Return the load of a force per volume (3,), stress over length; none for no force."""
     size = float(np.linalg.norm(body_force))
     if size == 0.0:
-        return None
-    direction = tuple(float(x / size) for x in body_force)
-    return Gravity(size / (_KPA_PER_MM * _STANDARD), direction, _STANDARD)
+        return []
+    x, y, z = (float(component) / size for component in body_force)
+    return [Gravity(size / (_KPA_PER_MM * _STANDARD), (x, y, z), _STANDARD)]
 
 
-def point_forces(
-    file: DeckFile, line: int, name: str, count: int, force: Sequence[float]
-) -> list[tuple[str, Force]]:
-    """Return a load for each node of a set, with the name of the set that it needs.
+def point_forces[K: Hashable](
+    file: DeckFile, line: int, node_sets: dict[str, list[K]], name: str, force: np.ndarray
+) -> list[Force]:
+    """Return a load for each node of a set, and add a set for it.
 
     A deck puts the whole force on each node of a set; here a set shares one force.
     """
-    if count > _MOST_POINTS:
-        file.skip(line, f"force on each of the {count} nodes of '{name}'; at most {_MOST_POINTS}")
+    nodes = node_sets[name]
+    if len(nodes) > _MOST_POINTS:
+        file.skip(line, f"a force on each of the {len(nodes)} nodes of '{name}', which are many")
         return []
-    names = [name] if count == 1 else [f"{name} {k + 1}" for k in range(count)]
-    resultant = np.asarray(force, dtype=float) / MN_PER_N
-    return [(point, Force(point, resultant)) for point in names]
+    sets = {f"{name} {k + 1}": [node] for k, node in enumerate(nodes)}
+    node_sets |= sets
+    return [Force(point, force / MN_PER_N) for point in sets]
 
 
 def only_material(
     file: DeckFile, materials: Mapping[str, Material], used: Mapping[str, int]
 ) -> Material:
-    """Return the material of the tetrahedra; refuse two that differ.
+    """Return the material of the tetrahedra; refuse two that differ, and values out of range.
 
     used : the names of the materials that elements have, each with the line that says so.
     """
     if not used:
         raise InputError(f"deck {file.path}: its tetrahedra have no material")
-    chosen = [materials[file.known(name, materials, "material", k)] for name, k in used.items()]
-    first, *others = chosen
+    first, *others = (
+        materials[file.known(name, materials, "material", line)] for name, line in used.items()
+    )
     for other in others:
-        if other.law != first.law:
+        if (other.law, other.values) != (first.law, first.values):
+            what = "values" if other.law == first.law else f"law '{first.law}'"
+            found = "others" if other.law == first.law else f"'{other.law}'"
             raise file.error(
-                other.line, f"a material of law '{other.law}', and line {first.line} has "
-                f"'{first.law}'; a scene has one law",
+                other.line, f"a second material: {found}, not the {what} of line {first.line}; "
+                "a scene has one material",
             )  # fmt: skip
-        if other.values != first.values:
-            raise file.error(
-                other.line, f"a material of other values than that of line {first.line}; "
-                "a scene has one, and regions by factors of its stiffness",
-            )  # fmt: skip
-    for quantity in find_law(first.law).quantities:
+    if first.law not in LAWS:
+        raise file.error(first.line, f"{first.law} is no law of this package")
+    for quantity in LAWS[first.law].quantities:
         if fault := quantity.value_fault(first.values[quantity.name]):
-            raise file.error(first.line, fault.replace(" kPa", ""))
+            raise file.error(first.line, fault)
+    for sentence in first.notes():
+        file.note(sentence)
     return first

@@ -20,7 +20,6 @@ import numpy as np
 from emulator.core.errors import InputError, look_up
 from emulator.core.units import IN_KPA, IN_MM
 from emulator.geometry.io import write_mesh
-from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws import find_law
 from emulator.mechanics.laws.law import Quantity
 from emulator.neighbours.decks.abaqus import read_abaqus
@@ -106,15 +105,16 @@ def draft_deck(path: Path, out: Path, unit: str | None = None) -> DeckDraft:
         notes.insert(0, note)
     if stress is None:
         stress = "kPa"
-        notes.insert(1, f"stresses are taken to be kPa; if they are in MPa, give --unit {length},MPa")
+        notes.insert(
+            1, f"stresses are taken to be kPa; if they are in MPa, give --unit {length},MPa"
+        )
     if deck.mesh.order == 1:
         notes.append("the elements are the deck's linear tetrahedra, which lock; see order")
     mesh = replace(deck.mesh, nodes=IN_MM[length] * deck.mesh.nodes)
     text = _scene(deck, path, mesh_path.name, IN_MM[length], IN_KPA[stress])
     unread = tuple(entry.sentence() for entry in sorted(deck.unread))
-    head = [f"From the {deck.program} deck {path.name}; lengths in mm, stresses in kPa.",
-            *(f"- {note}" for note in notes), *(f"- {sentence}" for sentence in unread)]  # fmt: skip
-    comments = "".join(f"# {line}\n" for line in head)
+    comments = f"# From the {deck.program} deck {path.name}; lengths in mm, stresses in kPa.\n"
+    comments += "".join(f"# - {sentence}\n" for sentence in (*notes, *unread))
     out.parent.mkdir(parents=True, exist_ok=True)
     try:
         write_mesh(mesh_path, mesh, *_directions(deck))
@@ -124,7 +124,9 @@ def draft_deck(path: Path, out: Path, unit: str | None = None) -> DeckDraft:
         for target in (out, mesh_path):
             target.unlink(missing_ok=True)
         reason = re.sub(rf"^scene file {re.escape(str(out))}(, line \d+)?: ", "", str(error))
-        missed = f"; {len(unread)} lines are not understood, the first {unread[0]}" if unread else ""
+        missed = (
+            f"; {len(unread)} lines are not understood, the first {unread[0]}" if unread else ""
+        )
         raise InputError(f"deck {file.path}: {reason}{missed}") from error
 
 

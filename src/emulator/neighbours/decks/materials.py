@@ -46,7 +46,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 SAME = "kappa/4 (J^2 - 1 - 2 ln J)"
-_MOST_TERMS = 3  # of Ogden's law
+LOGARITHMIC, QUADRATIC = "kappa/2 (ln J)^2", "kappa/2 (J - 1)^2"
+OTHER = "kappa (J - 1 - ln J)"
+
+Parameters = tuple[str, dict[str, float]]
+"""The name of a law, and its parameters."""
 
 
 class Material(NamedTuple):
@@ -72,15 +76,13 @@ class Material(NamedTuple):
         ]
 
 
-def ogden(mu: Sequence[float], alpha: Sequence[float], kappa: float) -> tuple[str, dict] | None:
-    """Return law and parameters of Ogden's sum; None for more terms than laws here have.
+def ogden(mu: Sequence[float], alpha: Sequence[float], kappa: float) -> Parameters:
+    """Return law and parameters of Ogden's sum; terms of zero modulus are left out.
 
-    Terms of zero modulus are left out.
+    A sum of more terms than three is no law here; its name is then unknown.
     """
     terms = [(m, a) for m, a in zip(mu, alpha, strict=True) if m != 0.0]
-    if not 1 <= len(terms) <= _MOST_TERMS:
-        return None
-    values = {}
+    values: dict[str, float] = {}
     for k, (m, a) in enumerate(terms, start=1):
         values |= {f"mu_{k}": m, f"alpha_{k}": a}
     return f"ogden_{len(terms)}", {**values, "kappa": kappa}
@@ -88,7 +90,7 @@ def ogden(mu: Sequence[float], alpha: Sequence[float], kappa: float) -> tuple[st
 
 def fibre_families(
     c: float, k_1: float, k_2: float, angle: float, dispersion: float, kappa: float
-) -> tuple[str, dict[str, float]]:
+) -> Parameters:
     """Return law and parameters of two families of fibres at ``angle`` (degrees) to both sides."""
     values = {"c": c, "k_1": k_1, "k_2": k_2, "angle": angle}
     if dispersion == 0.0:
@@ -96,7 +98,7 @@ def fibre_families(
     return "gasser_ogden_holzapfel", {**values, "dispersion": dispersion, "kappa": kappa}
 
 
-def split_neo_hookean(E: float, nu: float, penalty: float | None) -> tuple[str, dict[str, float]]:
+def split_neo_hookean(E: float, nu: float, penalty: float | None) -> Parameters:
     """Return law and parameters from Young's modulus, Poisson's ratio, and a bulk modulus."""
     mu = E / (2.0 * (1.0 + nu))
     kappa = E / (3.0 * (1.0 - 2.0 * nu)) if penalty is None else penalty

@@ -9,13 +9,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from emulator.core.errors import InputError
 from emulator.geometry.file_formats import read_cells
 from emulator.geometry.io import read_body, read_mesh
 from emulator.geometry.mesh import Mesh, find_rows
 from emulator.neighbours.decks.deck import AXES, Deck, DeckFile, only_material, support, weight
-from emulator.neighbours.decks.materials import Material, split_neo_hookean
-from emulator.neighbours.decks.tags import Tag, read_tags
+from emulator.neighbours.decks.materials import OTHER, QUADRATIC, Material, split_neo_hookean
+from emulator.neighbours.decks.tags import Tag, number, read_tags
 from emulator.scenes.loads import DeadPressure, FollowerPressure
 from emulator.scenes.part import BoundaryCondition, Load
 from emulator.scenes.supports import ElasticSupport
@@ -24,9 +23,11 @@ ROOTS = ("svMultiPhysicsFile", "svFSIFile")
 _EQUATIONS = ("struct", "ustruct")
 _NEO_HOOKEAN = ("nHK", "nHK91", "neoHookean", "neoHookeanSimo91")
 _HOLZAPFEL_OGDEN = ("HO", "HolzapfelOgden")
-_BULK = {"ST91": "", "Simo-Taylor91": "", "quad": "kappa/2 (J - 1)^2", "Quad": "kappa/2 (J - 1)^2",
-         "quadratic": "kappa/2 (J - 1)^2", "Quadratic": "kappa/2 (J - 1)^2",
-         "M94": "kappa (J - 1 - ln J)", "Miehe94": "kappa (J - 1 - ln J)"}  # fmt: skip
+_BULKS = {
+    **dict.fromkeys(("ST91", "Simo-Taylor91"), ""),
+    **dict.fromkeys(("quad", "Quad", "quadratic", "Quadratic"), QUADRATIC),
+    **dict.fromkeys(("M94", "Miehe94"), OTHER),
+}
 _SETTINGS = {"Coupled", "Min_iterations", "Max_iterations", "Tolerance", "Density", "LS", "Output",
              "Elasticity_modulus", "Poisson_ratio", "Constitutive_model", "Penalty_parameter",
              "Dilational_penalty_model", "Momentum_stabilization_coefficient", "Add_BC",
@@ -59,14 +60,11 @@ def read_svmultiphysics(file: DeckFile) -> Deck:
         raise file.error(domains[1].line, "a second domain; a scene has one material")
     material = only_material(file, {"": _material(file, domains[0])}, {"": domains[0].line})
     supports, loads = _conditions(file, equation, mesh)
-    acceleration = [_number(file, domains[0], f"Force_{axis}", 0.0) for axis in AXES]
-    load = weight([(material.density or 1.0) * x for x in acceleration])
-    loads += [] if load is None else [load]
+    acceleration = [number(file, domains[0], f"Force_{axis}", 0.0) for axis in AXES]
+    loads += weight([(material.density or 1.0) * x for x in acceleration])
     for tag in equation.children:
         if tag.name not in _SETTINGS:
             file.skip(tag.line, f"{tag.described()} in Add_equation")
-    for sentence in material.notes():
-        file.note(sentence)
     return Deck(
         "svMultiPhysics", mesh, material, tuple(supports), tuple(loads), fibres, sheets,
         tuple(file.unread), tuple(file.notes),
@@ -99,9 +97,10 @@ def _mesh(file: DeckFile, tag: Tag) -> tuple[Mesh, np.ndarray | None, np.ndarray
     directions = [_fibres(file, mesh, child)
                   for child in tag.all("Fiber_direction", "Fiber_direction_file_path")]  # fmt: skip
     node_sets = {name: np.unique(rows) for name, rows in facet_sets.items()}
-    scale = _number(file, tag, "Mesh_scale_factor", 1.0)
+    scale = number(file, tag, "Mesh_scale_factor", 1.0)
     scaled = Mesh(scale * mesh.nodes, mesh.elements, node_sets, facet_sets)
-    return scaled, *[*directions, None, None][:2]
+    fibres, sheets = [*directions, None, None][:2]
+    return scaled, fibres, sheets
 
 
 def _fibres(file: DeckFile, mesh: Mesh, tag: Tag) -> np.ndarray:
@@ -122,16 +121,18 @@ def _material(file: DeckFile, tag: Tag) -> Material:
         raise file.error(tag.line, "no <Constitutive_model>")
     kind = model.attributes.get("type", "")
     penalty = tag.first("Penalty_parameter")
-    kappa = None if penalty is None else _number(file, tag, "Penalty_parameter")
-    nu = _number(file, tag, "Poisson_ratio", 0.0)
-    E = _number(file, tag, "Elasticity_modulus", 0.0)
+    kappa = None if penalty is None else number(file, tag, "Penalty_parameter")
+    nu = number(file, tag, "Poisson_ratio", 0.0)
+    E = number(file, tag, "Elasticity_modulus", 0.0)
     if kappa is None and not nu < 0.5:
-        raise file.error(tag.line, f"Poisson's ratio {nu:g} without a penalty; it must be below 0.5")
+        raise file.error(
+            tag.line, f"Poisson's ratio {nu:g} without a penalty; it must be below 0.5"
+        )
     law, values = split_neo_hookean(E, nu, kappa)
     if kind in _HOLZAPFEL_OGDEN:
         names = {"a": "a", "b": "b", "a_f": "a4f", "b_f": "b4f", "a_s": "a4s", "b_s": "b4s",
                  "a_fs": "afs", "b_fs": "bfs"}  # fmt: skip
-        shape = {ours: _number(file, model, name) for ours, name in names.items()}
+        shape = {ours: number(file, model, name) for ours, name in names.items()}
         law, values = "holzapfel_ogden_orthotropic", {**shape, "kappa": 0.25 * values["kappa"]}
         file.note("fibres switch on at once here, and over a range of stretch in the deck (k)")
     elif kind not in _NEO_HOOKEAN:
@@ -140,8 +141,8 @@ def _material(file: DeckFile, tag: Tag) -> Material:
             "HolzapfelOgden",
         )  # fmt: skip
     volumetric = tag.words("Dilational_penalty_model", "ST91")
-    density = _number(file, tag, "Density", 1.0)
-    return Material(law, values, model.line, density, _BULK.get(volumetric, volumetric))
+    density = number(file, tag, "Density", 1.0)
+    return Material(law, values, model.line, density, _BULKS.get(volumetric, volumetric))
 
 
 def _conditions(
@@ -171,7 +172,7 @@ def _conditions(
         elif kind == "Robin" and tag.first("Robin_vtp_file_path") is None:
             normal = tag.words("Apply_along_normal_direction", "0") in ("true", "1")
             direction = "normal" if normal else "all"
-            stiffness = _number(file, tag, "Stiffness")
+            stiffness = number(file, tag, "Stiffness")
             supports.append(ElasticSupport(name, stiffness, direction))  # type: ignore[arg-type]
             if tag.first("Damping") is not None:
                 file.skip(tag.line, f"damping on '{name}', which statics has not")
@@ -184,22 +185,10 @@ def _value(file: DeckFile, tag: Tag) -> float:
     """Return the value of a condition: its last one, where a file has a table of them."""
     table = tag.first("Temporal_values_file_path")
     if table is None:
-        return _number(file, tag, "Value")
+        return number(file, tag, "Value")
     path = file.neighbour(table.text, table.line)
     rows = path.read_text(encoding="utf-8", errors="replace").split("\n")
     last = [row for row in rows[1:] if row.strip()][-1:]
     if not last:
         raise file.error(table.line, f"'{table.text}' has no values")
     return file.numbers(last[0], table.line, 2)[1]
-
-
-def _number(file: DeckFile, tag: Tag, name: str, default: float | None = None) -> float:
-    child = tag.first(name)
-    if child is None:
-        if default is None:
-            raise file.error(tag.line, f"{tag.described()} has no <{name}>")
-        return default
-    try:
-        return file.numbers(child.text, child.line, 1)[0]
-    except InputError as error:
-        raise InputError(f"{error} (<{name}>)") from None

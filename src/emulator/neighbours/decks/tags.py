@@ -81,3 +81,15 @@ def read_tags(file: DeckFile) -> Tag:
             f"deck {file.path}, line {error.lineno}: it is not valid XML ({reason})"
         ) from error
     return open_tags[0].children[0]
+
+
+def number(file: DeckFile, tag: Tag, name: str, default: float | None = None) -> float:
+    """Return the number of a child; ``default`` without one, or an error where that is None."""
+    child = tag.first(name)
+    if child is None and default is not None:
+        return default
+    if child is None:
+        raise file.error(tag.line, f"{tag.described()} has no <{name}>")
+    if child.attributes.get("type", "const") != "const":
+        raise file.error(child.line, f"{child.described()}; expected a number")
+    return file.numbers(child.text, child.line, 1)[0]
