@@ -288,12 +288,13 @@ def only_material(
     )
     for other in others:
         if (other.law, other.values) != (first.law, first.values):
-            what = "values" if other.law == first.law else f"law '{first.law}'"
-            found = "others" if other.law == first.law else f"'{other.law}'"
+            same = other.law == first.law
+            what = (
+                "other values than those" if same else f"'{other.law}', not '{first.law}' as that"
+            )
             raise file.error(
-                other.line, f"a second material: {found}, not the {what} of line {first.line}; "
-                "a scene has one material",
-            )  # fmt: skip
+                other.line, f"a second material: {what} of line {first.line}; a scene has one"
+            )
     if first.law not in LAWS:
         raise file.error(first.line, f"{first.law} is no law of this package")
     for quantity in LAWS[first.law].quantities:

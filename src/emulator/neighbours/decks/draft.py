@@ -117,6 +117,8 @@ def draft_deck(path: Path, out: Path, unit: str | None = None) -> DeckDraft:
     comments += "".join(f"# - {sentence}\n" for sentence in (*notes, *unread))
     out.parent.mkdir(parents=True, exist_ok=True)
     try:
+        if not deck.supports:
+            raise InputError("it prescribes no displacement, the body could move freely")
         write_mesh(mesh_path, mesh, *_directions(deck))
         out.write_text(f"{comments}\n{text}\n", encoding="utf-8")
         return DeckDraft(out, with_mesh(read_scene(out)), tuple(notes), unread)

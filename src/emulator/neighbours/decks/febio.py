@@ -275,17 +275,17 @@ class _FebioReading:
         return self.file.known(name, self.facet_sets, "surface", tag.line)
 
     def _read_load(self, tag: Tag, density: float) -> bool:
-        kind = (tag.name, tag.attributes.get("type", ""))
-        if kind == ("surface_load", "pressure"):
+        kind = f"{tag.name} {tag.attributes.get('type', '')}"
+        if kind == "surface_load pressure":
             name = self._surface(tag, tag.attributes.get("surface", ""))
             load = DeadPressure if tag.words("linear", "0") == "1" else FollowerPressure
             self.loads.append(load(name, self._scaled(tag, "pressure")))
-        elif kind == ("surface_load", "traction"):
+        elif kind == "surface_load traction":
             name = self._surface(tag, tag.attributes.get("surface", ""))
             x, y, z = self._vector(tag, "traction") * self._scaled(tag, "scale", 1.0)
             self.loads.append(Traction(name, (float(x), float(y), float(z))))
         elif tag.name == "nodal_load":
-            if kind[1] == "nodal_force":
+            if kind == "nodal_load nodal_force":
                 force = self._vector(tag, "value")
             else:
                 value = self._scaled(tag, "scale", 1.0) * self._scaled(tag, "value", 1.0)
@@ -294,9 +294,9 @@ class _FebioReading:
                 self.file, tag.line, self.node_sets, self._node_set(tag), force
             )
             return bool(force.any())
-        elif kind == ("body_load", "const"):
+        elif kind == "body_load const":
             self.loads += weight([-density * self._scaled(tag, axis, 0.0) for axis in AXES])
-        elif kind == ("body_load", "body force"):
+        elif kind == "body_load body force":
             self.loads += weight(-density * self._vector(tag, "force"))
         else:
             return False

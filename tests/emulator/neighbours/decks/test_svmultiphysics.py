@@ -79,9 +79,10 @@ def test_myocardium_on_springs_gives_the_scene_of_the_python_interface(tmp_path)
         law=em.find_law("holzapfel_ogden_orthotropic"),
         parameters=(em.Parameter("a", "kPa", 0.4, 0.6),),
         supports=(em.Support("left"), em.supports.ElasticSupport("right", 3.0, "normal")),
-        constants=dict(
-            b=8.0, a_f=18.0, b_f=16.0, a_s=2.5, b_s=11.0, a_fs=0.2, b_fs=11.5, kappa=25.0
-        ),
+        constants={
+            **{"b": 8.0, "a_f": 18.0, "b_f": 16.0, "a_s": 2.5, "b_s": 11.0},
+            **{"a_fs": 0.2, "b_fs": 11.5, "kappa": 25.0},
+        },
         fibres=fibres,
         sheets=np.tile([-0.8, 0.6, 0.0], (len(BLOCK.elements), 1)),
     )
