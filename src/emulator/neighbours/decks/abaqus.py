@@ -110,11 +110,12 @@ class _AbaqusReading:
             if block.keyword == "DENSITY":
                 density = values[0]
             elif block.keyword == "ELASTIC":
-                if self.finite or len(values) != 2 or block.options.get("TYPE", "ISO")[:3] != "ISO":
+                isotropic = block.options.get("TYPE", "ISO")[:3].upper() == "ISO"
+                if self.finite or not isotropic or len(block.rows) != 1 or len(values) < 2:
                     raise self.file.error(
                         block.line, "*Elastic is a law here without NLGEOM, of E and nu, only"
                     )
-                E, nu = values
+                E, nu = values[:2]  # a third number is a temperature
                 laws.append(("small_strain_E_nu", {"E": E, "nu": nu}, block.line, ""))
             elif block.keyword == "HYPERELASTIC":
                 laws.append((*self._isotropic(block, values), block.line, materials.QUADRATIC))
@@ -279,15 +280,19 @@ class _AbaqusReading:
             name = self.body.surface(row[0], line)
             self.loads.append(Traction(name, (float(x), float(y), float(z))))
             return True
+        pressure = FollowerPressure if self.finite else DeadPressure
+        value = scale * self.file.numbers(row[2:3] if kind[:1] == "P" else ["0"], line, 1)[0]
         if block.keyword == "DSLOAD" and kind == "P":
-            name = self.body.surface(row[0], line)
+            self.loads.append(pressure(self.body.surface(row[0], line), value))
         elif block.keyword == "DLOAD" and kind[:1] == "P" and face in ABAQUS_FACES:
-            name = f"{row[0]} {kind}"
-            self.body.facet_sets[name] = self.body.facets("", [(line, [row[0], face])])
+            # Decks list faces one by one: those of one pressure are one surface.
+            name = f"{row[2]} of line {block.line}"
+            facets = self.body.facets("", [(line, [row[0], face])])
+            if name not in self.body.facet_sets:
+                self.loads.append(pressure(name, value))
+            self.body.facet_sets.setdefault(name, []).extend(facets)
         else:
             return False
-        pressure = scale * self.file.numbers(row[2:3], line, 1)[0]
-        self.loads.append((FollowerPressure if self.finite else DeadPressure)(name, pressure))
         return True
 
     def _is_body(self, word: str, line: int) -> bool:
