@@ -75,7 +75,7 @@ class _AbaqusReading:
                 self.tables[block.keyword, name] = block
             elif block.keyword in _CONDITIONS:
                 self.conditions.append(block)
-            elif block.keyword == "STATIC" and len([*block.rows, []][0]) > 1:
+            elif block.keyword == "STATIC" and len([*block.rows, []][0]) > 1 and block.rows[0][1]:
                 self.period = file.numbers(block.rows[0][1:2], block.line, 1)[0]
             elif not self.body.read(block) and block.keyword not in _SETTINGS:
                 file.skip(block.line, block.described())
@@ -132,7 +132,8 @@ class _AbaqusReading:
         return Material(law, parameters, line, density, bulk)
 
     def _isotropic(self, block: Block, values: list[float]) -> Parameters:
-        order, options = int(block.options.get("N") or 1), " ".join(block.options)
+        order = self.file.keys([block.options.get("N") or "1"], block.line)[0]
+        options = " ".join(block.options)
         reduced, polynomial = "REDUCED" in options, "POLYNOMIAL" in options
         if "NEO HOOKE" in options or (reduced and order == 1):
             (c_10,), kappa = self._split(block, values, 1, 1)
@@ -187,8 +188,7 @@ class _AbaqusReading:
     def _directions(self, line: int) -> np.ndarray:
         """Return the directions (2, 3) of both families of fibres, in the local axes."""
         table = self._orientation()
-        count = 0 if table is None else int(table.options.get("LOCAL DIRECTIONS") or 0)
-        if table is None or count != 2 or len(table.rows) < 3:
+        if table is None or table.options.get("LOCAL DIRECTIONS") != "2" or len(table.rows) < 3:
             raise self.file.error(line, "its section needs an *Orientation, LOCAL DIRECTIONS=2")
         rows = [*table.numbered()][-2:]
         return np.array([self.file.unit(np.array(self.file.numbers(row[:3], k, 3)), k)
@@ -232,8 +232,10 @@ class _AbaqusReading:
         table = self.tables.get(("AMPLITUDE", name.upper()))
         if table is None:
             raise self.file.error(block.line, f"amplitude '{name}' is not in the deck")
-        pairs = np.reshape(self.file.numbers(table.words(), table.line), (-1, 2))
-        return float(np.interp(self.period, pairs[:, 0], pairs[:, 1]))
+        numbers = self.file.numbers(table.words(), table.line)
+        if not numbers or len(numbers) % 2:
+            raise self.file.error(table.line, "an amplitude has pairs of time and value")
+        return float(np.interp(self.period, numbers[::2], numbers[1::2]))
 
     def _read_condition(
         self, block: Block, line: int, row: list[str], scale: float, material: Material
@@ -251,14 +253,10 @@ class _AbaqusReading:
                 force = scale * self.file.numbers(row[2:3], line, 1)[0] * np.eye(3)[component - 1]
                 name = self.body.node_set(row[0], line)
                 self.loads += point_forces(self.file, line, self.body.node_sets, name, force)
-        elif kind in ("GRAV", "BX", "BY", "BZ"):
-            size = scale * self.file.numbers(row[2:3], line, 1)[0]
-            factor = 1.0 if kind != "GRAV" else material.density
-            if read := factor is not None and self._is_body(row[0], line):
-                along = np.array([float(kind[1] == axis) for axis in "XYZ"])
-                if kind == "GRAV":
-                    along = np.array(self.file.numbers(row[3:6], line, 3))
-                self.loads += weight((factor or 0.0) * size * along)
+        elif kind == "GRAV" and material.density is not None:
+            size, *along = self.file.numbers(row[2:6], line, 4)
+            if read := self._is_body(row[0], line):
+                self.loads += weight(scale * material.density * size * np.array(along))
         else:
             read = self._read_on_surface(block, line, row, scale)
         if not read:
@@ -272,9 +270,10 @@ class _AbaqusReading:
         return [k - 1 for k in range(first, last + 1) if 1 <= k <= 3]
 
     def _read_on_surface(self, block: Block, line: int, row: list[str], scale: float) -> bool:
-        kind, follows = row[1].upper(), block.options.get("FOLLOWER", "YES").upper()
-        face = f"S{kind[1:]}"
-        if kind == "TRVEC" and follows == "NO":
+        kind, face = row[1].upper(), f"S{row[1][1:]}"
+        keeps = block.options.get("FOLLOWER", "YES").upper() == "NO"  # its direction
+        keeps = keeps and block.options.get("CONSTANT RESULTANT", "NO").upper() == "YES"
+        if kind == "TRVEC" and (keeps or not self.finite):
             size, *direction = self.file.numbers(row[2:6], line, 4)
             x, y, z = scale * size * self.file.unit(np.array(direction), line)
             name = self.body.surface(row[0], line)

@@ -25,6 +25,7 @@ from emulator.scenes.supports import Support
 AXES = "xyz"
 _STANDARD = 9.81  # m/s2 of the weight's acceleration; the density makes up for it
 _KPA_PER_MM = 1.0e-3  # of 1 g/cm3 under 1 m/s2
+_MOST_KEYS = 10_000_000  # numbers of one line of a set
 _MOST_POINTS = 50  # nodes of one load, each of which gets a force by itself
 
 
@@ -104,9 +105,16 @@ class DeckFile:
     def keys(self, words: Sequence[str], line: int) -> list[int]:
         """Return whole numbers, such as the nodes of an element."""
         for word in words:
-            if not word.strip().isdigit():
+            if not word.strip().isdecimal():
                 raise self.error(line, f"'{word.strip()[:40]}' is not the number of a node")
         return [int(word) for word in words]
+
+    def span(self, words: Sequence[str], line: int) -> range:
+        """Return the numbers from a first to a last one, by a step where there are three words."""
+        first, last, step = [*self.keys(words, line), 1][:3] if len(words) > 1 else (0, 0, 0)
+        if step < 1 or not 0 <= (last - first) // step < _MOST_KEYS:
+            raise self.error(line, f"'{', '.join(words)[:40]}' are no numbers from, to, by")
+        return range(first, last + 1, step)
 
     def unit(self, vector: np.ndarray, line: int) -> np.ndarray:
         """Return a direction (3,) of length one."""

@@ -67,7 +67,7 @@ def reader_of(path: Path) -> Callable[[DeckFile], Deck] | None:
         return None
     if suffix == ".inp":
         text = path.read_text(encoding="utf-8", errors="replace")
-        return read_abaqus if re.search(r"(?im)^\s*\*\s*(material|include)\b", text) else None
+        return read_abaqus if re.search(r"(?im)^\s*\*\s*(material|step)\b", text) else None
     with path.open("rb") as file:
         head = file.read(_HEAD)
     return read_svmultiphysics if any(f"<{root}".encode() in head for root in ROOTS) else None

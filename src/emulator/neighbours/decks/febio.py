@@ -84,6 +84,8 @@ class _FebioReading:
         self.prescribed: dict[tuple[str, int], float] = {}
         self.loads: list[Load] = []
         self.end: float | None = None
+        # FEBio 4 takes tractions per area as it is, earlier versions per area at rest.
+        self.usual_linear = "0" if root.attributes["version"] == "4.0" else "1"
 
     def deck(self) -> Deck:
         """Return the content."""
@@ -158,8 +160,8 @@ class _FebioReading:
     def _read_node_set(self, tag: Tag) -> list[int]:
         keys = [self._key(node) for node in tag.children]
         for word in tag.text.replace(",", " ").split():
-            first, *rest = self.file.keys(word.split(":"), tag.line)  # or first:last:step
-            keys += range(first, (rest or [first])[0] + 1, *rest[1:])
+            words = word.split(":")  # a number, or first:last:step
+            keys += self.file.span(words if len(words) > 1 else [word, word], tag.line)
         for key in keys:
             if key not in self.nodes:
                 raise self.file.error(tag.line, f"a set has node {key}, which does not exist")
@@ -281,6 +283,8 @@ class _FebioReading:
             load = DeadPressure if tag.words("linear", "0") == "1" else FollowerPressure
             self.loads.append(load(name, self._scaled(tag, "pressure")))
         elif kind == "surface_load traction":
+            if tag.words("linear", self.usual_linear) != "1":
+                return False  # per area as it is
             name = self._surface(tag, tag.attributes.get("surface", ""))
             x, y, z = self._vector(tag, "traction") * self._scaled(tag, "scale", 1.0)
             self.loads.append(Traction(name, (float(x), float(y), float(z))))
@@ -290,10 +294,10 @@ class _FebioReading:
             else:
                 value = self._scaled(tag, "scale", 1.0) * self._scaled(tag, "value", 1.0)
                 force = value * np.eye(3)[self._components(tag)].sum(axis=0)
-            self.loads += point_forces(
-                self.file, tag.line, self.node_sets, self._node_set(tag), force
-            )
-            return bool(force.any())
+            if not force.any():
+                return False
+            name = self._node_set(tag)
+            self.loads += point_forces(self.file, tag.line, self.node_sets, name, force)
         elif kind == "body_load const":
             self.loads += weight([-density * self._scaled(tag, axis, 0.0) for axis in AXES])
         elif kind == "body_load body force":

@@ -114,10 +114,10 @@ class Instances:
     def _members_in(self, block: Block) -> list[str]:
         if "GENERATE" not in block.options:
             return block.words()
-        members = []
+        members = list[str]()
         for line, row in block.numbered():
-            first, last, *step = self.file.keys([word for word in row if word], line)
-            members += [str(k) for k in range(first, last + 1, *step)]
+            words = [word for word in row if word]
+            members += map(str, self.file.span(words, line))
         return members
 
     def _add(self, kind: str, name: str, block: Block, members: Iterable[str]) -> None:
@@ -211,8 +211,8 @@ class Instances:
         for instance, word, line in (row for of_scope in rows for row in of_scope):
             where, _, label = word.upper().rpartition(".")
             where = where or instance or owner
-            inside = [(where, int(label))] if label.isdigit() else []
-            if not label.isdigit() and (where, label) != (owner, name) and name not in outer:
+            inside = [(where, int(label))] if label.isdecimal() else []
+            if not label.isdecimal() and (where, label) != (owner, name) and name not in outer:
                 inside = self.members(kind, where, label, (*outer, name))
             if not inside or not set(inside) <= set(known):
                 raise self.file.error(line, f"set '{name}': there is no {noun} or set {word}")
@@ -222,7 +222,7 @@ class Instances:
     def elements_of(self, owner: str, word: str, line: int) -> list[Key]:
         """Return the elements that a word names: a set, or one element."""
         where, _, label = word.upper().rpartition(".")
-        key = (where or owner, int(label) if label.isdigit() else -1)
+        key = (where or owner, int(label) if label.isdecimal() else -1)
         members = [key] if key in self.elements else self.members("ELSET", key[0], label)
         if not members:
             raise self.file.error(line, f"element set '{word}' is not in the deck")
@@ -248,7 +248,7 @@ class Instances:
     def node_set(self, word: str, line: int) -> str:
         """Return the scene's name of a node set, made for one node where a word is its number."""
         where, _, label = word.upper().rpartition(".")
-        if label.isdigit() and (where, int(label)) in self.nodes:
+        if label.isdecimal() and (where, int(label)) in self.nodes:
             self.node_sets[name := f"node {word}"] = [(where, int(label))]
             return name
         return self._named(word, self.node_sets, "node set", line)

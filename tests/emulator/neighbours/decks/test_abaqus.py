@@ -44,7 +44,7 @@ def test_a_pressure_on_a_surface_follows_with_nlgeom(tmp_path, nlgeom):
 
 def test_yeoh_under_a_dead_traction_in_mpa(tmp_path):
     """Of 0.003 MPa along (2, 0, 0), whose length does not matter."""
-    load = "*Dsload, follower=NO\nright_face, TRVEC, 0.003, 2., 0., 0."
+    load = "*Dsload, follower=NO, constant resultant=YES\nright_face, TRVEC, 0.003, 2., 0., 0."
     material = "*Hyperelastic, yeoh\n0.002, 0.0003, 0.0001, 20., 0., 0."
     draft = drafted(tmp_path / "y.inp", abaqus(material, f"{abaqus_supports()}\n{load}"), "mm,MPa")
 

@@ -150,7 +150,7 @@ def test_fibres_of_each_element_give_the_scene_of_the_python_interface(tmp_path)
 
 def test_what_is_not_understood_is_listed_by_its_line(tmp_path):
     more = '<Contact>\n<contact type="sliding-elastic" name="c"/>\n</Contact>'
-    load = '<surface_load type="fluidflux" surface="top"/>'
+    load = '<surface_load type="traction" surface="top"><traction>0,0,1</traction></surface_load>'
     material = 'type="neo-Hookean"><E>30</E><v>0.3</v><viscosity>1</viscosity>'
     supports = febio_supports("4.0", {"left": "xyz"})
     text = febio("4.0", material, supports, load, more=more)
