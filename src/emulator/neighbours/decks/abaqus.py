@@ -108,7 +108,7 @@ class _AbaqusReading:
         for block in blocks:
             values = self.file.numbers(block.words(), [*block.lines, block.line][0])
             if block.keyword == "DENSITY":
-                density = values[0]
+                density = [*values, None][0]
             elif block.keyword == "ELASTIC":
                 isotropic = block.options.get("TYPE", "ISO")[:3].upper() == "ISO"
                 if self.finite or not isotropic or len(block.rows) != 1 or len(values) < 2:

@@ -29,17 +29,6 @@ _MOST_KEYS = 10_000_000  # numbers of one line of a set
 _MOST_POINTS = 50  # nodes of one load, each of which gets a force by itself
 
 
-class Unread(NamedTuple):
-    """A line of a deck that was not understood, and the words there."""
-
-    line: int
-    text: str
-
-    def sentence(self) -> str:
-        """Return the line and the words."""
-        return f"line {self.line} is not understood: {self.text}"
-
-
 @dataclass(frozen=True, eq=False)
 class Deck:
     """The content of a deck, in its own units.
@@ -51,7 +40,7 @@ class Deck:
     material : the law and its parameters.
     supports, loads : those that the scene gets.
     fibres, sheets : unit vectors (m, 3), one an element, or None.
-    unread : the lines that were not understood.
+    unread : a sentence for each line that was not understood.
     notes : sentences on equations that differ.
     """
 
@@ -62,16 +51,21 @@ class Deck:
     loads: tuple[Load, ...]
     fibres: np.ndarray | None
     sheets: np.ndarray | None
-    unread: tuple[Unread, ...]
+    unread: tuple[str, ...]
     notes: tuple[str, ...]
 
 
 @dataclass(eq=False)
 class DeckFile:
-    """A deck that is being read: its path, and what was not understood so far."""
+    """A deck that is being read.
+
+    path : its path.
+    unread : each line that was not understood so far, and the words there.
+    notes : sentences on equations that differ.
+    """
 
     path: Path
-    unread: list[Unread] = field(default_factory=list)
+    unread: list[tuple[int, str]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
     def error(self, line: int, problem: str) -> InputError:
@@ -81,7 +75,7 @@ class DeckFile:
     def skip(self, line: int, text: str) -> None:
         """Keep a line that is not understood; its text is cut to what a comment may hold."""
         words = "".join(letter if letter.isprintable() else " " for letter in text).split()
-        self.unread.append(Unread(line, " ".join(words)[:100]))
+        self.unread.append((line, " ".join(words)[:100]))
 
     def note(self, sentence: str) -> None:
         """Keep a sentence, once."""
@@ -146,23 +140,15 @@ class DeckFile:
 def finished(
     program: str, file: DeckFile, mesh: Mesh, material: Material,
     prescribed: Mapping[tuple[str, int], float], loads: Iterable[Load],
-    axes: tuple[np.ndarray | None, np.ndarray | None],
+    axes: tuple[np.ndarray | None, np.ndarray | None], springs: Iterable[BoundaryCondition] = (),
 ) -> Deck:  # fmt: skip
     """Return a deck that was read; ``prescribed`` has displacements by node set and component."""
     values: dict[str, dict[int, float]] = {}
     for (name, axis), value in prescribed.items():
         values.setdefault(name, {})[axis] = value
-    supports = tuple(support(name, of_set) for name, of_set in values.items())
-    return Deck(
-        program,
-        mesh,
-        material,
-        supports,
-        tuple(loads),
-        *axes,
-        tuple(file.unread),
-        tuple(file.notes),
-    )
+    supports = (*(support(name, of_set) for name, of_set in values.items()), *springs)
+    unread = tuple(f"line {line} is not understood: {text}" for line, text in sorted(file.unread))
+    return Deck(program, mesh, material, supports, tuple(loads), *axes, unread, tuple(file.notes))
 
 
 def read_text(path: Path) -> str:
@@ -296,10 +282,9 @@ def only_material(
     )
     for other in others:
         if (other.law, other.values) != (first.law, first.values):
-            same = other.law == first.law
-            what = (
-                "other values than those" if same else f"'{other.law}', not '{first.law}' as that"
-            )
+            what = f"other values of '{first.law}' than those"
+            if other.law != first.law:
+                what = f"'{other.law}', not '{first.law}' as that"
             raise file.error(
                 other.line, f"a second material: {what} of line {first.line}; a scene has one"
             )

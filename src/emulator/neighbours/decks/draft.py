@@ -112,7 +112,7 @@ def draft_deck(path: Path, out: Path, unit: str | None = None) -> DeckDraft:
         notes.append("the elements are the deck's linear tetrahedra, which lock; see order")
     mesh = replace(deck.mesh, nodes=IN_MM[length] * deck.mesh.nodes)
     text = _scene(deck, path, mesh_path.name, IN_MM[length], IN_KPA[stress])
-    unread = tuple(entry.sentence() for entry in sorted(deck.unread))
+    unread = deck.unread
     comments = f"# From the {deck.program} deck {path.name}; lengths in mm, stresses in kPa.\n"
     comments += "".join(f"# - {sentence}\n" for sentence in (*notes, *unread))
     out.parent.mkdir(parents=True, exist_ok=True)

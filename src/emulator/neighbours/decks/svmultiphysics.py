@@ -12,11 +12,11 @@ from scipy.spatial import cKDTree
 from emulator.geometry.file_formats import read_cells
 from emulator.geometry.io import read_body, read_mesh
 from emulator.geometry.mesh import Mesh, find_rows
-from emulator.neighbours.decks.deck import AXES, Deck, DeckFile, only_material, support, weight
+from emulator.neighbours.decks.deck import AXES, Deck, DeckFile, finished, only_material, weight
 from emulator.neighbours.decks.materials import OTHER, QUADRATIC, Material, split_neo_hookean
 from emulator.neighbours.decks.tags import Tag, number, read_tags
 from emulator.scenes.loads import DeadPressure, FollowerPressure
-from emulator.scenes.part import BoundaryCondition, Load
+from emulator.scenes.part import Load
 from emulator.scenes.supports import ElasticSupport
 
 ROOTS = ("svMultiPhysicsFile", "svFSIFile")
@@ -59,16 +59,14 @@ def read_svmultiphysics(file: DeckFile) -> Deck:
     if len(domains) > 1:
         raise file.error(domains[1].line, "a second domain; a scene has one material")
     material = only_material(file, {"": _material(file, domains[0])}, {"": domains[0].line})
-    supports, loads = _conditions(file, equation, mesh)
+    prescribed, springs, loads = _conditions(file, equation, mesh)
     acceleration = [number(file, domains[0], f"Force_{axis}", 0.0) for axis in AXES]
     loads += weight([(material.density or 1.0) * x for x in acceleration])
     for tag in equation.children:
         if tag.name not in _SETTINGS:
             file.skip(tag.line, f"{tag.described()} in Add_equation")
-    return Deck(
-        "svMultiPhysics", mesh, material, tuple(supports), tuple(loads), fibres, sheets,
-        tuple(file.unread), tuple(file.notes),
-    )  # fmt: skip
+    axes = fibres, sheets
+    return finished("svMultiPhysics", file, mesh, material, prescribed, loads, axes, springs)
 
 
 def _mesh(file: DeckFile, tag: Tag) -> tuple[Mesh, np.ndarray | None, np.ndarray | None]:
@@ -147,8 +145,10 @@ def _material(file: DeckFile, tag: Tag) -> Material:
 
 def _conditions(
     file: DeckFile, equation: Tag, mesh: Mesh
-) -> tuple[list[BoundaryCondition], list[Load]]:
-    supports: list[BoundaryCondition] = []
+) -> tuple[dict[tuple[str, int], float], list[ElasticSupport], list[Load]]:
+    """Return prescribed displacements by face and component, springs, and loads."""
+    prescribed: dict[tuple[str, int], float] = {}
+    springs: list[ElasticSupport] = []
     loads: list[Load] = []
     for tag in equation.all("Add_BC"):
         name, kind = tag.attributes.get("name", ""), tag.words("Type")
@@ -161,8 +161,7 @@ def _conditions(
             along = file.numbers(words, tag.line, 3)
             displaced = tag.words("Impose_on_state_variable_integral", "false") in ("true", "1")
             if value == 0.0 or displaced:
-                axes = {k: value * x for k, x in enumerate(along) if x}
-                supports.append(support(name, axes))
+                prescribed |= {(name, k): value * x for k, x in enumerate(along) if x}
                 continue
             fault = "a velocity"
         elif kind in ("Neu", "Neumann") and not fault:
@@ -173,12 +172,12 @@ def _conditions(
             normal = tag.words("Apply_along_normal_direction", "0") in ("true", "1")
             direction = "normal" if normal else "all"
             stiffness = number(file, tag, "Stiffness")
-            supports.append(ElasticSupport(name, stiffness, direction))  # type: ignore[arg-type]
+            springs.append(ElasticSupport(name, stiffness, direction))  # type: ignore[arg-type]
             if tag.first("Damping") is not None:
                 file.skip(tag.line, f"damping on '{name}', which statics has not")
             continue
         file.skip(tag.line, f"condition {kind} on '{name}'{f', {fault}' if fault else ''}")
-    return supports, loads
+    return prescribed, springs, loads
 
 
 def _value(file: DeckFile, tag: Tag) -> float:

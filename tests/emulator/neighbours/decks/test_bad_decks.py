@@ -59,7 +59,7 @@ INP = abaqus("*Hyperelastic, neo hooke\n2.0, 0.025", abaqus_supports())
         (DECK.replace('mat="tissue"', 'mat="tisue"'), "material 'tisue' is not in the deck"),
         (DECK.replace('lc="1"', 'lc="7"'), "load curve 7 is not there, or has no points"),
         (TWO.format("incomp neo-Hookean"), "a second material: 'neo_hookean_split', not 'neo_"),
-        (TWO.format("neo-Hookean"), "a second material: other values than those of line 5"),
+        (TWO.format("neo-Hookean"), "a second material: other values of 'neo_hookean_E_nu' "),
         (DECK.replace('name="left">', 'name="left">99,'), "a set has node 99, which does not"),
         (DECK.replace("zero disp", "zero"), "it prescribes no displacement, the body"),
         (DECK.replace("<z_dof>1", "<z_dof>0"), "its supports leave 1 of the 6 rigid motions free"),
