@@ -241,6 +241,16 @@ def imbalance(scene, displacement):
     return float(np.abs(forces(scene, displacement)[~prescribed]).max())
 
 
+def judged(scene, energy, stretches):
+    """The largest error (mN) of a block that is stretched along x, by hand.
+
+    Of the forces on free components, which vanish, and of the one on the face x = 0, whose area is 1.
+    """
+    u = stretched(scene, stretches)
+    held_back = forces(scene, u)[scene.mesh.nodes[:, 0] == 0.0, 0].sum()
+    return max(imbalance(scene, u), float(abs(held_back + nominal(energy, stretches)[0])))
+
+
 def stretched(scene, stretches):
     """The displacement (n, 3) of principal stretches."""
     return scene.mesh.nodes * (np.asarray(stretches) - 1.0)
