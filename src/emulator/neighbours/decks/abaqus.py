@@ -162,6 +162,8 @@ class _AbaqusReading:
                 block.line, f"{len(values)} constants, D1 is 0: no law here is incompressible; "
                 "give D1, 2 over some hundred times the shear modulus",
             )  # fmt: skip
+        if len(values) > count + bulks + 1:  # one more is a temperature
+            self.file.skip(block.line, f"{block.described()}: constants at further temperatures")
         if any(bulk[1:]):
             self.file.skip(block.line, f"{block.described()}: D2 and D3, which are not 0")
         return values[:count], 2.0 / bulk[0]

@@ -44,6 +44,16 @@ def test_a_pressure_on_a_surface_follows_with_nlgeom(tmp_path, nlgeom):
     assert any("no NLGEOM" in note for note in draft.notes) == (nlgeom == "NO")
 
 
+def test_constants_at_another_temperature_and_a_thermal_load_are_listed(tmp_path):
+    text = abaqus(f"{NEO_HOOKE}, 20.\n3., 0.02, 40.", f"{abaqus_supports()}\n*Dflux\nbody, BF, 1.")
+    draft = drafted(tmp_path / "t.inp", text)
+    lines = text.splitlines()
+    assert draft.scene.constants == {"kappa": 80.0}
+    for sentence, start in zip(draft.unread, ("*Hyperelastic", "*Dflux"), strict=True):
+        number = int(sentence.split()[1])
+        assert lines[number - 1].startswith(start)
+
+
 def test_yeoh_under_a_dead_traction_in_mpa(tmp_path):
     """Of 0.003 MPa along (2, 0, 0), whose length does not matter."""
     load = "*Dsload, follower=NO, constant resultant=YES\nright_face, TRVEC, 0.003, 2., 0., 0."
