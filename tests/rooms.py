@@ -45,6 +45,7 @@ ROOMS = {
         "calibrate.cli.commands.cohort",
     ),
     "external": ("emulator.external", "calibrate.external"),
+    "neighbours": ("emulator.neighbours",),
     "predictions": ("calibrate.prediction", "calibrate.cli.commands.prediction"),
     "released": (
         "emulator.released",

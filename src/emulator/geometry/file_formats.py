@@ -32,7 +32,7 @@ from emulator.core.errors import InputError
 from emulator.geometry.mesh import boundary_facets, find_rows
 
 # Corners of the faces of Abaqus's tetrahedra, and types of elements that meshio does not know.
-_FACES = {"S1": (0, 1, 2), "S2": (0, 3, 1), "S3": (1, 3, 2), "S4": (2, 3, 0)}
+ABAQUS_FACES = {"S1": (0, 1, 2), "S2": (0, 3, 1), "S3": (1, 3, 2), "S4": (2, 3, 0)}
 _TYPES = {"C3D4H": "tetra", "C3D4T": "tetra", "C3D10HS": "tetra10", "M3D3": "triangle"}
 
 
@@ -236,10 +236,10 @@ class _AbaqusPart:
     def _triangles(self, name: str, corners: dict[str, list[str]]) -> dict[str, list[str]]:
         """Return the nodes of the faces of a surface; ``corners`` has the nodes of each element."""
         faces = {
-            f"{name} {k} {face}": [corners[k][c] for c in _FACES[face.upper()]]
+            f"{name} {k} {face}": [corners[k][c] for c in ABAQUS_FACES[face.upper()]]
             for which, face in ((row[0], row[-1]) for row in self.sets["FACES"][name])
             for k in self.numbers("ELSET", which.upper())
-            if face.upper() in _FACES and len(corners.get(k, ())) in (4, 10)
+            if face.upper() in ABAQUS_FACES and len(corners.get(k, ())) in (4, 10)
         }
         if not faces:
             self.unread[f"surface {self.names[name]}, which has no faces S1 to S4"] = None

@@ -105,10 +105,8 @@ def draft_scene(
     body = read_body(mesh_path)
     notes: list[str] = []
     if unit is None:
-        extent = float(np.ptp(body.mesh.nodes, axis=0).max())
-        unit = "um" if extent > _MICROMETRES else "mm" if extent >= _METRES else "m"
-        hint = "; if it is in cm, give --unit cm" if unit == "mm" and extent < _SMALL else ""
-        notes.append(f"the body is {extent:.4g} long: taken to be {unit}{hint}")
+        unit, note = guessed_unit(float(np.ptp(body.mesh.nodes, axis=0).max()))
+        notes.append(note)
     out.parent.mkdir(parents=True, exist_ok=True)
     body, mesh_name = _in_mm(body, mesh_path, out, unit, notes)
     mesh = body.mesh
@@ -153,6 +151,13 @@ def draft_scene(
     if mesh_name == f"{mesh_path.stem}_mm.vtu" and unit != "mm":
         out.with_name(mesh_name).unlink()
     raise InputError(f"mesh file {mesh_path}: {failure}")
+
+
+def guessed_unit(extent: float) -> tuple[str, str]:
+    """Return the unit of length that a body's greatest extent suggests, and a sentence on it."""
+    unit = "um" if extent > _MICROMETRES else "mm" if extent >= _METRES else "m"
+    hint = "; if it is in cm, give --unit cm" if unit == "mm" and extent < _SMALL else ""
+    return unit, f"the body is {extent:.4g} long: taken to be {unit}{hint}"
 
 
 def _in_mm(body: Body, path: Path, out: Path, unit: str, notes: list[str]) -> tuple[Body, str]:

@@ -116,7 +116,7 @@ def test_toml_that_is_nested_deep_is_refused_in_a_line(capsys, tmp_path, value):
             "frame.txt is a frame of DICe, in pixels with y down: write its points as point,x,y",
         ),
         ("log.txt", "*Step = 1\n*Time = 0.1\n*Data = x;y\n1 0.5 0.5\n", "is a log of FEBio: write"),
-        ("m.feb", "<febio_spec/>", "it is FEBio's; FEBio Studio exports the mesh as .vtk"),
+        ("m.feb", "<febio_spec/>", "<febio_spec>; expected <febio_spec>, version 2.5, 3.0, 4.0"),
         ("m.vtu", '<?xml version="1.0"?><febio_spec/>', "it is FEBio's"),
         ("m.pts", "1\n0 0 0\n", "it is openCARP's; meshtool convert -imsh=m -omsh=m -ofmt=vtk"),
     ],

@@ -16,6 +16,7 @@ from calibrate.cli import words
 from calibrate.cli.output import table
 from calibrate.cli.words import Answer, command, option
 from emulator.core.errors import InputError
+from emulator.core.rooms import offered
 from emulator.core.store import check_folder, to_json
 
 if TYPE_CHECKING:
@@ -27,9 +28,19 @@ _FAR = 0.15  # of the body's length
 
 
 @command(
-    option("mesh", "FILE", "mesh of tetrahedra, or the table of a specimen's test"),
-    option("--out", "FILE.toml", "file to write (default: beside the first)"),
-    option("--unit", "mm|cm|m|um", "of the mesh's coordinates (default: guessed, and said)"),
+    option(
+        "mesh",
+        "FILE",
+        "mesh of tetrahedra, the table of a specimen's test, or the input deck of FEBio, Abaqus, "
+        "CalculiX or svMultiPhysics",
+    ),
+    option("--out", "FILE.toml", "file to write (default: beside the first); of a deck, or DIR"),
+    option(
+        "--unit",
+        "mm|cm|m|um",
+        "of the mesh's coordinates (default: guessed, and said); of a deck with that of stresses, "
+        "as in mm,MPa (default: kPa)",
+    ),
     option(
         "--law",
         "NAME",
@@ -69,6 +80,9 @@ def init(arguments: Namespace) -> Answer:
     draft = _init_specimen if is_table else _init_scene
     if arguments.inputs:
         return _init_runs(source, out, arguments)
+    for reader_of in offered("emulator.neighbours.decks.draft", "reader_of"):
+        if reader_of(source) is not None:
+            return _init_deck(source, arguments)
     if len(laws) < 2:
         return draft(source, out, laws[0] if laws else None, arguments)
     answers, reasons = dict[str, Answer](), dict[str, str]()
@@ -118,11 +132,28 @@ def _init_scene(mesh_path: Path, out: Path, law: str | None, arguments: Namespac
     if arguments.tube is not None:
         raise InputError("--tube is for a table of stretches and pressures, not for a mesh")
     draft = draft_scene(mesh_path, out, unit=arguments.unit, law=law)
-    scene, mesh = draft.scene, draft.scene.mesh
-    notes = [*draft.notes, *_weight_notes(scene)]
+    notes = [*draft.notes, *_weight_notes(draft.scene)]
+    return _of_scene(draft.path, draft.scene, notes, "look for CHANGE in it, then: ")
+
+
+def _init_deck(deck: Path, arguments: Namespace) -> Answer:
+    """Write mesh and scene of another program's deck, and list what was not understood."""
+    from emulator.neighbours.decks.draft import draft_deck
+
+    for name in ("law", "tube"):
+        if getattr(arguments, name):
+            raise InputError(f"--{name} has no effect on a deck, which has its own law and loads")
+    draft = draft_deck(deck, Path(arguments.out or deck.parent), arguments.unit)
+    answer = _of_scene(draft.path, draft.scene, [*draft.notes, *draft.unread], "then: ")
+    return Answer({**answer.result, "unread": list(draft.unread)}, answer.text)
+
+
+def _of_scene(path: Path, scene: Scene, notes: list[str], then: str) -> Answer:
+    """Return what a scene file that was written has."""
+    mesh = scene.mesh
     facets = {name: len(rows) for name, rows in mesh.facet_sets.items()}
     result = {
-        "out": str(draft.path),
+        "out": str(path),
         "nodes": len(mesh.nodes),
         "elements": len(mesh.elements),
         "node_sets": {name: len(nodes) for name, nodes in mesh.node_sets.items()},
@@ -137,7 +168,7 @@ def _init_scene(mesh_path: Path, out: Path, law: str | None, arguments: Namespac
         f"{len(mesh.nodes)} nodes, {len(mesh.elements)} tetrahedra",
         f"sets: {', '.join(sets) or 'none'}",
         *notes,
-        f"written to {draft.path}; look for CHANGE in it, then: calibrate simulate {draft.path}",
+        f"written to {path}; {then}calibrate simulate {path}",
     ]
     return Answer(result, "\n".join(lines))
 
