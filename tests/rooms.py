@@ -46,6 +46,11 @@ ROOMS = {
     ),
     "external": ("emulator.external", "calibrate.external"),
     "predictions": ("calibrate.prediction", "calibrate.cli.commands.prediction"),
+    "neighbours": (
+        "emulator.neighbours",
+        "calibrate.neighbours",
+        "calibrate.cli.commands.export",
+    ),
     "released": (
         "emulator.released",
         "emulator.verify",

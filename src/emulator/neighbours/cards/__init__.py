@@ -1,8 +1,8 @@
 """Material cards of other programs, one program a file.
 
-Each file has a :class:`~emulator.neighbours.cards.card.Program`: the forms in which it has our laws,
-its units, and how it takes a body with fibres. :data:`PROGRAMS` is the only list of them. To add a
-program, write its file and add a line here; ``docs/neighbours.md`` has a column for each.
+Each file has a :class:`~emulator.neighbours.cards.card.Program`: the forms in which it has our
+laws, its units, and how it takes a body with fibres. :data:`PROGRAMS` is the only list of them. To
+add a program, write its file and add a line here; ``docs/neighbours.md`` has a column for each.
 """
 
 from emulator.neighbours.cards.abaqus import ABAQUS
@@ -14,8 +14,7 @@ from emulator.neighbours.cards.pulse import PULSE
 from emulator.neighbours.cards.svmultiphysics import SVMULTIPHYSICS
 
 PROGRAMS: dict[str, Program] = {
-    program.name: program
-    for program in (FEBIO, ABAQUS, FELUPE, PULSE, SVMULTIPHYSICS, CALCULIX)
+    program.name: program for program in (FEBIO, ABAQUS, FELUPE, PULSE, SVMULTIPHYSICS, CALCULIX)
 }
 """The programs by the word that names each on the command line."""
 

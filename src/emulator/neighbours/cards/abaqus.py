@@ -49,7 +49,7 @@ def _two_families(v: Values) -> str:
 
 
 def write_body(folder: Path, body: ExportedBody) -> list[str]:
-    """Write ``body.inp``: mesh, sets, axes of fibre and sheet, with the material of ``mean.inp``."""
+    """Write ``body.inp``: mesh, sets and axes, with the material of ``mean.inp``."""
     lines, section = mesh_lines(body), "*SOLID SECTION, ELSET=BODY, MATERIAL=TISSUE"
     if (axes := body.axes) is not None:
         lines += ["*DISTRIBUTION TABLE, NAME=TWO_VECTORS", "COORD3D, COORD3D"]
@@ -74,9 +74,7 @@ ABAQUS = Program(
     },
     refusals={
         **dict.fromkeys(("guccione", "fung_orthotropic", "fung_planar"), _ISOCHORIC),
-        **dict.fromkeys(
-            ("neo_hookean", "neo_hookean_E_nu"), "its neo-Hookean energy is isochoric"
-        ),
+        **dict.fromkeys(("neo_hookean", "neo_hookean_E_nu"), "its neo-Hookean energy is isochoric"),
     },
     write_body=write_body,
     usage="`*INCLUDE, INPUT=mean.inp` reads a card; `body.inp` does, and needs a step. Cards with "

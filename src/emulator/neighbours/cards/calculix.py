@@ -72,9 +72,7 @@ CALCULIX = Program(
     },
     refusals={
         "gasser_ogden_holzapfel": "its fibres are not dispersed",
-        **dict.fromkeys(
-            ("neo_hookean", "neo_hookean_E_nu"), "its neo-Hookean energy is isochoric"
-        ),
+        **dict.fromkeys(("neo_hookean", "neo_hookean_E_nu"), "its neo-Hookean energy is isochoric"),
     },
     write_body=write_body,
     usage="`*INCLUDE, INPUT=mean.inp` reads a card; `body.inp` does, and needs a step. Cards with "

@@ -134,7 +134,7 @@ def write_card(program: Program, law: Law, values: Values) -> str:
 
 
 def moduli_at_rest(law: Law, values: Values) -> tuple[float, float]:
-    """Return the bulk modulus and the shear modulus (kPa) of a law at rest, between fibre and sheet."""
+    """Return the bulk modulus and the shear modulus from fibre to sheet, at rest, in kPa."""
     axes = jnp.eye(3)[:2]
     parameters = [jnp.asarray(values[quantity.name]) for quantity in law.quantities]
     dilation, shear = jnp.eye(3) / 3.0, jnp.zeros((3, 3)).at[0, 1].set(1.0)
@@ -149,7 +149,7 @@ def moduli_at_rest(law: Law, values: Values) -> tuple[float, float]:
 
 
 def digits(value: float) -> str:
-    """Return a number in the form of cards: 13 digits in 19 characters, of which CalculiX reads 20."""
+    """Return a number with 13 digits, in the 20 characters that CalculiX reads at most."""
     return f"{value:.12e}"
 
 

@@ -211,9 +211,7 @@ FEBIO = Program(
             lambda v: _uncoupled("Mooney-Rivlin", v["kappa"], _entries(c1=v["mu"] / 2.0, c2=0.0))
         ),
         "mooney_rivlin": Form(
-            lambda v: _uncoupled(
-                "Mooney-Rivlin", v["kappa"], _entries(c1=v["c_10"], c2=v["c_01"])
-            )
+            lambda v: _uncoupled("Mooney-Rivlin", v["kappa"], _entries(c1=v["c_10"], c2=v["c_01"]))
         ),
         "yeoh": Form(
             lambda v: _uncoupled(
@@ -223,7 +221,7 @@ FEBIO = Program(
         "ogden_1": Form(_ogden),
         "ogden_2": Form(_ogden),
         "ogden_3": Form(_ogden),
-        "holzapfel_ogden_isotropic": Form(_mixture(lambda v: []), differs=_MIXED),
+        "holzapfel_ogden_isotropic": Form(_mixture(lambda _: []), differs=_MIXED),
         "holzapfel_ogden": Form(_mixture(_parallel), differs=_MIXED),
         "holzapfel_ogden_dispersed": Form(_mixture(_dispersed), differs=_MIXED),
         "holzapfel_gasser_ogden": Form(_two_families),
@@ -245,11 +243,9 @@ FEBIO = Program(
             "it has no material with the shear between fibres and sheets",
         ),
         "fung_planar": "its Fung material has no plane without resistance across",
-        **dict.fromkeys(
-            ("small_strain", "small_strain_E_nu"), "its analyses are of finite strain"
-        ),
+        **dict.fromkeys(("small_strain", "small_strain_E_nu"), "its analyses are of finite strain"),
     },
     write_body=write_body,
-    usage="`<Material from=\"mean.feb\"/>` reads a card; `body.feb` does, and needs a `Control`, "
+    usage='`<Material from="mean.feb"/>` reads a card; `body.feb` does, and needs a `Control`, '
     "boundary conditions and loads. Axis 1 of `mat_axis` is the fibre, axis 2 the sheet.",
 )

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -112,9 +113,7 @@ shear = numpy.sin(2 * beta) * g
 both = numpy.cos(beta) ** 2 * f + numpy.sin(beta) ** 2 * s
 one = tm.maximum({0} * x + (1 - 3 * {0}) * (both + shear), 0.0)
 other = tm.maximum({0} * x + (1 - 3 * {0}) * (both - shear), 0.0)"""
-_ARTERY = (
-    "c / 2 * x + k_1 / (2 * k_2) * (tm.exp(k_2 * one**2) + tm.exp(k_2 * other**2) - 2)"
-)
+_ARTERY = "c / 2 * x + k_1 / (2 * k_2) * (tm.exp(k_2 * one**2) + tm.exp(k_2 * other**2) - 2)"
 _TERMS = """\
 f, s = tm.maximum(f, 0.0), tm.maximum(s, 0.0)
 isotropic = I1 * x / 2 + I1_2 * x**2 / 2 + I1_e / 20 * (tm.exp(10 * x) - 1)
@@ -135,12 +134,12 @@ Q = b_f * ff**2 + b_t * (square - 2 * row + ff**2) + 2 * b_fs * (row - ff**2)"""
 
 def write_body(folder: Path, body: ExportedBody) -> list[str]:
     """Write ``body.npz``, the mesh and its directions, and ``case.py``, which builds the solid."""
-    arrays = {"points": body.mesh.nodes, "cells": body.mesh.elements}
+    arrays: dict[str, Any] = {"points": body.mesh.nodes, "cells": body.mesh.elements}
     for name, directions in (("fibre", body.fibres), ("sheet", body.sheets)):
         if directions is not None:
             arrays[name] = np.ascontiguousarray(directions.T[:, None])  # (3, 1, m)
     arrays |= {f"nodes {name}": nodes for name, nodes in body.mesh.node_sets.items()}
-    np.savez(folder / "body.npz", allow_pickle=False, **arrays)
+    np.savez(folder / "body.npz", **arrays)
     linear = body.mesh.order == 1
     kind, region = ("tetra", "RegionTetra") if linear else ("tetra10", "RegionQuadraticTetra")
     text = _CASE.replace("KIND", kind).replace("REGION", region)
@@ -148,7 +147,7 @@ def write_body(folder: Path, body: ExportedBody) -> list[str]:
     return ["body.npz", "case.py"]
 
 
-_CASE = '''"""The body in FElupe: ``build("mean")`` gives its field and its solid of a card's material."""
+_CASE = '''"""The body in FElupe: ``build("mean")`` gives its field, and its solid of a card."""
 
 import importlib.util
 from pathlib import Path
@@ -187,9 +186,7 @@ _FORMS: Mapping[str, Form] = {
     "holzapfel_ogden_isotropic": _form("x", _MATRIX, _FOUR_VOLUMES),
     "holzapfel_ogden": _form("x f", f"{_MATRIX} + {_fibres('f')}", _FOUR_VOLUMES, _TENSION),
     "holzapfel_ogden_unswitched": _form("x f", f"{_MATRIX} + {_fibres('f')}", _FOUR_VOLUMES),
-    "holzapfel_ogden_released": _form(
-        "x f", f"2 * {_MATRIX} + 2 * {_fibres('f')}", _FOUR_VOLUMES
-    ),
+    "holzapfel_ogden_released": _form("x f", f"2 * {_MATRIX} + 2 * {_fibres('f')}", _FOUR_VOLUMES),
     "holzapfel_ogden_dispersed": _form(
         "x f", f"{_MATRIX} + {_fibres('f')}", _FOUR_VOLUMES, f"{_MEAN}\n{_TENSION}"
     ),
@@ -212,9 +209,7 @@ _FORMS: Mapping[str, Form] = {
         "x f",
         "c_0 * (tm.exp(c_1 * x**2 + c_2 * (tm.sqrt(f + 1) - 1) ** 4) - 1) + mu / 2 * x",
     ),
-    "invariant_terms": _form(
-        "x y f s g", "isotropic + fibres + sheets + shear", before=_TERMS
-    ),
+    "invariant_terms": _form("x y f s g", "isotropic + fibres + sheets + shear", before=_TERMS),
 }
 FELUPE = Program(
     name="felupe",

@@ -21,19 +21,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import meshio
 import numpy as np
 
 from emulator.neighbours.cards.card import ExportedBody, Form, Program, Values
 
-_UNITS = {"a": "kPa", "b": "dimensionless", "mu": "kPa"}
-_SWITCH_OFF = "use_subplus=False, use_heaviside=False"
+_SWITCH_OFF = ["use_subplus=False", "use_heaviside=False"]
 
 
 def _module(name: str, values: Values, kappa: float, words: str = "") -> str:
+    units = {key: "dimensionless" if key[0] == "b" else "kPa" for key in values}
     quantities = [
-        f"        {key}=pulse.Variable({value!r}, {_UNITS.get(key, _UNITS[key[0]])!r}),\n"
+        f"        {key}=pulse.Variable({value!r}, {units[key]!r}),\n"
         for key, value in values.items()
     ]
     return (
@@ -53,7 +54,7 @@ def _exponential(*names: str, factor: float = 1.0, switch: bool = True) -> Calla
         values = {n: factor * v[n] if n.startswith("a") else v[n] for n in names}
         directions = [f"{d}0={d}0" for d in ("f", "s") if f"a_{d}" in names]
         words = [", ".join(directions)] if directions else []
-        words += [] if switch else [_SWITCH_OFF]
+        words += [] if switch else _SWITCH_OFF
         lines = "".join(f"        {line},\n" for line in words)
         return _module("HolzapfelOgden", values, 4.0 * v["kappa"], lines)
 
@@ -66,13 +67,13 @@ def write_body(folder: Path, body: ExportedBody) -> list[str]:
     content = meshio.Mesh(body.mesh.nodes, [(kind, body.mesh.elements)])
     meshio.write(folder / "body.xdmf", content, file_format="xdmf", data_format="XML")
     axes = body.axes
-    arrays = {} if axes is None else {"f0": axes[:, 0], "s0": axes[:, 1]}
-    np.savez(folder / "body.npz", allow_pickle=False, **arrays)
+    arrays: dict[str, Any] = {} if axes is None else {"f0": axes[:, 0], "s0": axes[:, 1]}
+    np.savez(folder / "body.npz", **arrays)
     (folder / "case.py").write_text(_CASE, encoding="utf-8")
     return ["body.xdmf", "body.npz", "case.py"]
 
 
-_CASE = '''"""The body in pulse: ``build("mean")`` gives its mesh and the model of a card's material."""
+_CASE = '''"""The body in pulse: ``build("mean")`` gives its mesh, and the model of a card."""
 
 import importlib.util
 from pathlib import Path
@@ -112,9 +113,7 @@ _FORMS: Mapping[str, Form] = {
     "holzapfel_ogden": Form(_exponential(*_FIBRES)),
     "holzapfel_ogden_unswitched": Form(_exponential(*_FIBRES, switch=False)),
     "holzapfel_ogden_released": Form(_exponential(*_FIBRES, factor=2.0, switch=False)),
-    "holzapfel_ogden_orthotropic": Form(
-        _exponential(*_FIBRES, "a_s", "b_s", "a_fs", "b_fs")
-    ),
+    "holzapfel_ogden_orthotropic": Form(_exponential(*_FIBRES, "a_s", "b_s", "a_fs", "b_fs")),
 }
 PULSE = Program(
     name="pulse",
@@ -124,11 +123,9 @@ PULSE = Program(
     forms=_FORMS,
     refusals={
         "guccione": "its Guccione energy is of the isochoric strain, so that forces would differ",
-        **dict.fromkeys(
-            ("neo_hookean", "neo_hookean_E_nu"), "its neo-Hookean energy is isochoric"
-        ),
+        **dict.fromkeys(("neo_hookean", "neo_hookean_E_nu"), "its neo-Hookean energy is isochoric"),
     },
     write_body=write_body,
-    usage="A card is a module: `from mean import material, compressibility`. `case.py` builds mesh, "
-    "directions and model of any card; give `StaticProblem` the parameter `mesh_unit` of `mm`.",
+    usage="A card is a module: `from mean import material, compressibility`. `case.py` builds "
+    "mesh, directions and model of any card; give `StaticProblem` the `mesh_unit` `mm`.",
 )

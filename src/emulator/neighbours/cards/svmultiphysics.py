@@ -50,7 +50,10 @@ def _card(kind: str, bulk: float, inner: Mapping[str, float], outer: Mapping[str
 
 def _elastic(mu: float, kappa: float) -> dict[str, float]:
     """Return E and nu of a shear and a bulk modulus in kPa."""
-    E, nu = 9.0 * kappa * mu / (3.0 * kappa + mu), (3.0 * kappa - 2.0 * mu) / (6.0 * kappa + 2.0 * mu)
+    E, nu = (
+        9.0 * kappa * mu / (3.0 * kappa + mu),
+        (3.0 * kappa - 2.0 * mu) / (6.0 * kappa + 2.0 * mu),
+    )
     return {"Elasticity_modulus": E, "Poisson_ratio": nu}
 
 
@@ -128,11 +131,9 @@ SVMULTIPHYSICS = Program(
             "its arterial fibres resist compression, too, so that forces would differ",
         ),
         "guccione": "its Guccione energy is of the isochoric strain, so that forces would differ",
-        **dict.fromkeys(
-            ("neo_hookean", "neo_hookean_E_nu"), "its neo-Hookean energy is isochoric"
-        ),
+        **dict.fromkeys(("neo_hookean", "neo_hookean_E_nu"), "its neo-Hookean energy is isochoric"),
     },
     write_body=write_body,
-    usage="Put a card's elements into `Add_equation type=\"struct\"`, `body.vtu` and both "
+    usage='Put a card\'s elements into `Add_equation type="struct"`, `body.vtu` and both '
     "`Fiber_direction_file_path` (fibres, then sheets) into `Add_mesh`. Faces are not written.",
 )
