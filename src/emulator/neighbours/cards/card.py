@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.errors import InputError
+from emulator.core.kept import kept
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.kinematics import Strain
 from emulator.mechanics.laws.law import Law
@@ -135,17 +136,25 @@ def write_card(program: Program, law: Law, values: Values) -> str:
 
 def moduli_at_rest(law: Law, values: Values) -> tuple[float, float]:
     """Return the bulk modulus and the shear modulus from fibre to sheet, at rest, in kPa."""
+    parameters = jnp.asarray([values[quantity.name] for quantity in law.quantities])
+    bulk, shear = _curvatures(law)(parameters)
+    return float(bulk), float(shear)
+
+
+@kept
+def _curvatures(law: Law) -> Callable[[jax.Array], jax.Array]:
+    """Return the compiled function from the parameters (k,) to both moduli at rest, (2,)."""
     axes = jnp.eye(3)[:2]
-    parameters = [jnp.asarray(values[quantity.name]) for quantity in law.quantities]
     dilation, shear = jnp.eye(3) / 3.0, jnp.zeros((3, 3)).at[0, 1].set(1.0)
 
-    def curvature(direction: jax.Array) -> jax.Array:
+    def curvature(direction: jax.Array, parameters: jax.Array) -> jax.Array:
         def energy(amount: jax.Array) -> jax.Array:
             return law.energy(Strain(amount * direction, None, axes), *parameters)
 
         return jax.grad(jax.grad(energy))(jnp.zeros(()))
 
-    return float(curvature(dilation)), float(curvature(shear))
+    directions = jnp.stack([dilation, shear])
+    return jax.jit(lambda p: jax.vmap(curvature, (0, None))(directions, p))
 
 
 def digits(value: float) -> str:

@@ -32,8 +32,8 @@ import numpy as np
 
 from emulator.neighbours.cards.card import ExportedBody, Form, Program, Values, digits
 
-SHARP = 1e4
-"""The k of the switch."""
+SHARP = 1e3
+"""The k of the switch: larger ones overflow at stretches of 1.3."""
 
 
 def _card(kind: str, bulk: float, inner: Mapping[str, float], outer: Mapping[str, float]) -> str:
