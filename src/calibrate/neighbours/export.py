@@ -51,7 +51,7 @@ class Export:
     differs: tuple[str, ...]
 
 
-def export(
+def export_posterior(
     run: str | Path, program: str, out: str | Path, *, draws: int = 20, mesh: bool = False
 ) -> Export:
     """Write the posterior in the folder ``run`` as cards of ``program`` into a new folder.

@@ -118,7 +118,8 @@ def test_a_law_that_the_program_lacks_is_refused_in_a_line(name):
 def test_the_moduli_at_rest_are_those_of_the_law():
     bulk, shear = moduli_at_rest(LAWS["neo_hookean"], {"mu": 3.0, "lam": 7.0})
     np.testing.assert_allclose([bulk, shear], [7.0 + 2.0 * 3.0 / 3.0, 3.0], rtol=1e-12)
-    bulk, shear = moduli_at_rest(LAWS["holzapfel_ogden_isotropic"], dict(a=3.0, b=2.0, kappa=25.0))
+    values = {"a": 3.0, "b": 2.0, "kappa": 25.0}
+    bulk, shear = moduli_at_rest(LAWS["holzapfel_ogden_isotropic"], values)
     np.testing.assert_allclose([bulk, shear], [100.0, 3.0], rtol=1e-12)
 
 

@@ -16,7 +16,7 @@ def _add_program(parser: ArgumentParser) -> None:
 
 
 @command(
-    option("run", "RUN", "folder of calibrate infer, of one body"),
+    option("folder", "RUN", "folder of calibrate infer, of one body"),
     _add_program,
     option("--out", "DIR", "a new folder for the cards and a README", required=True),
     option("--draws", "N", "cards of N draws beside mean and median (default 20)", type=int,
@@ -30,10 +30,10 @@ def _add_program(parser: ArgumentParser) -> None:
 )  # fmt: skip
 def export(arguments: Namespace) -> Answer:
     """Export a posterior."""
-    from calibrate.neighbours import export as export_run
+    from calibrate.neighbours import export_posterior
 
-    result = export_run(
-        arguments.run, arguments.to, arguments.out, draws=arguments.draws, mesh=arguments.mesh
+    result = export_posterior(
+        arguments.folder, arguments.to, arguments.out, draws=arguments.draws, mesh=arguments.mesh
     )
     lines = [
         f"law '{result.law}' for {result.program}: {len(result.files)} files in {result.folder}"
