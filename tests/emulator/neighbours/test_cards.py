@@ -1,6 +1,7 @@
 """Cards, read from their text, give our stress by the programs' own formulas."""
 
 from functools import cache
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -103,6 +104,26 @@ def test_felupe_takes_every_law_and_ten_go_elsewhere():
     assert PROGRAMS["felupe"].forms.keys() == LAWS.keys()
     others = {law for name, law in PAIRS if name != "felupe"}
     assert len(others) >= 10
+
+
+def test_the_page_has_every_form():
+    page = Path(__file__).parents[3] / "docs" / "neighbours.md"
+    lines = [line.split(" | ") for line in page.read_text(encoding="utf-8").splitlines()]
+    header = next(cells for cells in lines if cells[0] == "| law")
+    assert [cell.rstrip(" |") for cell in header[1:]] == list(PROGRAMS)
+    table = {
+        cells[0].split("`")[1]: [cell.strip(" |") for cell in cells[1:]]
+        for cells in lines
+        if len(cells) == len(header) and cells[0].startswith("| `")
+    }
+
+    def word(form):
+        smooth = form is not None and any("smooth" in sentence for sentence in form.differs)
+        return (
+            "" if form is None else "penalty" if form.penalty else "switch" if smooth else "equal"
+        )
+
+    assert table == {law: [word(p.forms.get(law)) for p in PROGRAMS.values()] for law in LAWS}
 
 
 @pytest.mark.parametrize("name", PROGRAMS)

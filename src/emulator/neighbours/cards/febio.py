@@ -49,6 +49,7 @@ from pathlib import Path
 import numpy as np
 
 from emulator.core.errors import InputError
+from emulator.mechanics.kinematics import cofactor, determinant
 from emulator.neighbours.cards.card import ExportedBody, Form, Program, Values, digits, row
 
 _FIBRE = '<fiber type="vector">1,0,0</fiber>'
@@ -123,7 +124,7 @@ def _two_families(v: Values) -> str:
 
 def _fung(normal: np.ndarray, shear: Iterable[float], C: float, kappa: float) -> str:
     """Return the Fung material of ``normal`` (3, 3) and ``shear`` (12, 23, 31) moduli in kPa."""
-    S = np.linalg.inv(normal)
+    S = np.asarray(cofactor(normal) / determinant(normal))  # normal is symmetric
     E = 1.0 / np.diag(S)
     ratios = {"v12": -S[0, 1] * E[0], "v23": -S[1, 2] * E[1], "v31": -S[2, 0] * E[2]}
     moduli = dict(zip(("E1", "E2", "E3"), E.tolist(), strict=True))
