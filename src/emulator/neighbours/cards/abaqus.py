@@ -20,15 +20,14 @@ from __future__ import annotations
 from math import cos, radians, sin
 from pathlib import Path
 
-from emulator.neighbours.cards.card import ExportedBody, Form, Program, Values
-from emulator.neighbours.cards.inp import (
-    PER_KPA,
-    data,
-    deck,
-    distribution_lines,
-    isotropic_forms,
-    mesh_lines,
+from emulator.neighbours.cards.card import (
+    ISOCHORIC_NEO_HOOKEAN,
+    ExportedBody,
+    Form,
+    Program,
+    Values,
 )
+from emulator.neighbours.cards.inp import PER_KPA, data, deck, isotropic_forms, write_deck
 
 
 def _two_families(v: Values) -> str:
@@ -49,18 +48,16 @@ def _two_families(v: Values) -> str:
 
 
 def write_body(folder: Path, body: ExportedBody) -> list[str]:
-    """Write ``body.inp``: mesh, sets and axes, with the material of ``mean.inp``."""
-    lines, section = mesh_lines(body), "*SOLID SECTION, ELSET=BODY, MATERIAL=TISSUE"
-    if (axes := body.axes) is not None:
-        lines += ["*DISTRIBUTION TABLE, NAME=TWO_VECTORS", "COORD3D, COORD3D"]
-        lines.append("*DISTRIBUTION, NAME=FIBRE_AXES, LOCATION=ELEMENT, TABLE=TWO_VECTORS")
-        lines += distribution_lines(axes.reshape(-1, 6))
-        section += ", ORIENTATION=FIBRES"
-    lines += ["*INCLUDE, INPUT=mean.inp", section]
-    (folder / "body.inp").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return ["body.inp"]
+    """Write ``body.inp``: mesh, sets and axes of fibre and sheet."""
+    axes = None if body.axes is None else body.axes.reshape(-1, 6)
+    return write_deck(folder, body, "TISSUE", axes, _DISTRIBUTION)
 
 
+_DISTRIBUTION = (
+    "*DISTRIBUTION TABLE, NAME=TWO_VECTORS",
+    "COORD3D, COORD3D",
+    "*DISTRIBUTION, NAME=FIBRE_AXES, LOCATION=ELEMENT, TABLE=TWO_VECTORS",
+)
 _ISOCHORIC = "its Fung energies are of the isochoric strain, so that forces would differ"
 ABAQUS = Program(
     name="abaqus",
@@ -74,7 +71,7 @@ ABAQUS = Program(
     },
     refusals={
         **dict.fromkeys(("guccione", "fung_orthotropic", "fung_planar"), _ISOCHORIC),
-        **dict.fromkeys(("neo_hookean", "neo_hookean_E_nu"), "its neo-Hookean energy is isochoric"),
+        **ISOCHORIC_NEO_HOOKEAN,
     },
     write_body=write_body,
     usage="`*INCLUDE, INPUT=mean.inp` reads a card; `body.inp` does, and needs a step. Cards with "

@@ -22,16 +22,14 @@ from pathlib import Path
 
 import numpy as np
 
-from emulator.neighbours.cards.card import ExportedBody, Form, Program, Values
-from emulator.neighbours.cards.inp import (
-    PER_KPA,
-    SQUARE,
-    data,
-    deck,
-    distribution_lines,
-    isotropic_forms,
-    mesh_lines,
+from emulator.neighbours.cards.card import (
+    ISOCHORIC_NEO_HOOKEAN,
+    ExportedBody,
+    Form,
+    Program,
+    Values,
 )
+from emulator.neighbours.cards.inp import PER_KPA, SQUARE, data, deck, isotropic_forms, write_deck
 
 _FIBRE_NAME = "ELASTIC_FIBER_TISSUE"
 
@@ -49,16 +47,12 @@ def _two_families(v: Values) -> str:
 
 
 def write_body(folder: Path, body: ExportedBody) -> list[str]:
-    """Write ``body.inp``: mesh, sets and axes, with the material of ``mean.inp``."""
-    lines, section = mesh_lines(body), "*SOLID SECTION, ELSET=BODY, MATERIAL=TISSUE"
-    if (axes := body.axes) is not None:
-        fibres, sheets = axes[:, 0], axes[:, 1]
-        six = np.concatenate([sheets, np.cross(fibres, sheets)], axis=1)
-        lines += ["*DISTRIBUTION, NAME=FIBRE_AXES", *distribution_lines(six)]
-        section = f"*SOLID SECTION, ELSET=BODY, MATERIAL={_FIBRE_NAME}, ORIENTATION=FIBRES"
-    lines += ["*INCLUDE, INPUT=mean.inp", section]
-    (folder / "body.inp").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return ["body.inp"]
+    """Write ``body.inp``: mesh, sets and axes of sheet and fibre x sheet."""
+    head = ["*DISTRIBUTION, NAME=FIBRE_AXES"]
+    if (axes := body.axes) is None:
+        return write_deck(folder, body, "TISSUE", None, head)
+    six = np.concatenate([axes[:, 1], np.cross(axes[:, 0], axes[:, 1])], axis=1)
+    return write_deck(folder, body, _FIBRE_NAME, six, head)
 
 
 CALCULIX = Program(
@@ -72,7 +66,7 @@ CALCULIX = Program(
     },
     refusals={
         "gasser_ogden_holzapfel": "its fibres are not dispersed",
-        **dict.fromkeys(("neo_hookean", "neo_hookean_E_nu"), "its neo-Hookean energy is isochoric"),
+        **ISOCHORIC_NEO_HOOKEAN,
     },
     write_body=write_body,
     usage="`*INCLUDE, INPUT=mean.inp` reads a card; `body.inp` does, and needs a step. Cards with "

@@ -31,6 +31,14 @@ LEAST_RATIO = 20.0
 
 Values = Mapping[str, float]
 """Parameters of a law by name, in the law's units."""
+ISOCHORIC_NEO_HOOKEAN = dict.fromkeys(
+    ("neo_hookean", "neo_hookean_E_nu"), "its neo-Hookean energy is isochoric"
+)
+"""The refusal of compressible neo-Hookean laws by programs that split all of their energies."""
+OTHER_GUCCIONE = {
+    "guccione": "its Guccione energy is of the isochoric strain, so that forces would differ"
+}
+"""The refusal by programs that split Guccione's energy as well."""
 
 
 @dataclass(frozen=True)
@@ -155,6 +163,11 @@ def _curvatures(law: Law) -> Callable[[jax.Array], jax.Array]:
 
     directions = jnp.stack([dilation, shear])
     return jax.jit(lambda p: jax.vmap(curvature, (0, None))(directions, p))
+
+
+def engineering(mu: float, lam: float) -> tuple[float, float]:
+    """Return Young's modulus, in the unit of Lame's parameters, and Poisson's ratio."""
+    return mu * (3.0 * lam + 2.0 * mu) / (lam + mu), lam / (2.0 * (lam + mu))
 
 
 def digits(value: float) -> str:

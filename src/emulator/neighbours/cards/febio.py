@@ -46,11 +46,20 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.mechanics.kinematics import cofactor, determinant
-from emulator.neighbours.cards.card import ExportedBody, Form, Program, Values, digits, row
+from emulator.neighbours.cards.card import (
+    ExportedBody,
+    Form,
+    Program,
+    Values,
+    digits,
+    engineering,
+    row,
+)
 
 _FIBRE = '<fiber type="vector">1,0,0</fiber>'
 _VOLUME = "<pressure_model>Abaqus (GOH)</pressure_model>"
@@ -77,9 +86,17 @@ def _uncoupled(kind: str, bulk: float, lines: Iterable[str]) -> str:
     return _card(kind, [*_entries(k=bulk), _VOLUME, *lines])
 
 
+def _same(kind: str, **names: str) -> Form:
+    """Return the form of an uncoupled material that has our parameters under its ``names``."""
+
+    def write(v: Values) -> str:
+        return _uncoupled(kind, v["kappa"], _entries(**{key: v[n] for key, n in names.items()}))
+
+    return Form(write)
+
+
 def _lame(v: Values) -> str:
-    mu, lam = v["mu"], v["lam"]
-    E, nu = mu * (3.0 * lam + 2.0 * mu) / (lam + mu), lam / (2.0 * (lam + mu))
+    E, nu = engineering(v["mu"], v["lam"])
     return _card("neo-Hookean", _entries(E=E, v=nu))
 
 
@@ -124,7 +141,8 @@ def _two_families(v: Values) -> str:
 
 def _fung(normal: np.ndarray, shear: Iterable[float], C: float, kappa: float) -> str:
     """Return the Fung material of ``normal`` (3, 3) and ``shear`` (12, 23, 31) moduli in kPa."""
-    S = np.asarray(cofactor(normal) / determinant(normal))  # normal is symmetric
+    K = jnp.asarray(normal)
+    S = np.asarray(cofactor(K) / determinant(K))  # K is symmetric
     E = 1.0 / np.diag(S)
     ratios = {"v12": -S[0, 1] * E[0], "v23": -S[1, 2] * E[1], "v31": -S[2, 0] * E[2]}
     moduli = dict(zip(("E1", "E2", "E3"), E.tolist(), strict=True))
@@ -211,14 +229,8 @@ FEBIO = Program(
         "neo_hookean_split": Form(
             lambda v: _uncoupled("Mooney-Rivlin", v["kappa"], _entries(c1=v["mu"] / 2.0, c2=0.0))
         ),
-        "mooney_rivlin": Form(
-            lambda v: _uncoupled("Mooney-Rivlin", v["kappa"], _entries(c1=v["c_10"], c2=v["c_01"]))
-        ),
-        "yeoh": Form(
-            lambda v: _uncoupled(
-                "Yeoh", v["kappa"], _entries(c1=v["c_1"], c2=v["c_2"], c3=v["c_3"])
-            )
-        ),
+        "mooney_rivlin": _same("Mooney-Rivlin", c1="c_10", c2="c_01"),
+        "yeoh": _same("Yeoh", c1="c_1", c2="c_2", c3="c_3"),
         "ogden_1": Form(_ogden),
         "ogden_2": Form(_ogden),
         "ogden_3": Form(_ogden),

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from emulator.neighbours.cards.card import ExportedBody, Form, Program, Values
+from emulator.neighbours.cards.card import ExportedBody, Form, Program, Values, engineering
 
 _HEAD = '''"""A material of FElupe, in mm, kPa and mN. Fibres (3, ...) are unit vectors at rest."""
 
@@ -82,13 +82,11 @@ def _lame(v: Values) -> str:
 
 def _lame_of_engineering(v: Values) -> str:
     E, nu = v["E"], v["nu"]
-    lam = E * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
-    return _lame({"mu": E / (2.0 * (1.0 + nu)), "lam": lam})
+    return _lame({"mu": E / (2.0 * (1.0 + nu)), "lam": E * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))})
 
 
 def _linear(v: Values) -> str:
-    mu, lam = v["mu"], v["lam"]
-    E, nu = mu * (3.0 * lam + 2.0 * mu) / (lam + mu), lam / (2.0 * (lam + mu))
+    E, nu = engineering(v["mu"], v["lam"])
     return f"LinearElastic(E={E!r}, nu={nu!r})"
 
 
@@ -105,7 +103,10 @@ def _fibres(name: str) -> str:
 
 
 _MATRIX = "a / (2 * b) * (tm.exp(b * x) - 1)"
+_PARALLEL = f"{_MATRIX} + {_fibres('f')}"
 _TENSION = "f = tm.maximum(f, 0.0)"
+_ORTHOTROPIC = f"{_PARALLEL} + {_fibres('s')} + a_fs / (2 * b_fs) * (tm.exp(b_fs * g**2) - 1)"
+_BOTH_TENSIONS = f"{_TENSION}\ns = tm.maximum(s, 0.0)"
 _MEAN = "f = dispersion * x + (1 - 3 * dispersion) * f"
 _FAMILIES = """\
 beta = numpy.deg2rad(angle)
@@ -184,22 +185,12 @@ _FORMS: Mapping[str, Form] = {
     "yeoh": _form("x", "c_1 * x + c_2 * x**2 + c_3 * x**3"),
     **{f"ogden_{terms}": _ogden(terms) for terms in (1, 2, 3)},
     "holzapfel_ogden_isotropic": _form("x", _MATRIX, _FOUR_VOLUMES),
-    "holzapfel_ogden": _form("x f", f"{_MATRIX} + {_fibres('f')}", _FOUR_VOLUMES, _TENSION),
-    "holzapfel_ogden_unswitched": _form("x f", f"{_MATRIX} + {_fibres('f')}", _FOUR_VOLUMES),
-    "holzapfel_ogden_released": _form("x f", f"2 * {_MATRIX} + 2 * {_fibres('f')}", _FOUR_VOLUMES),
-    "holzapfel_ogden_dispersed": _form(
-        "x f", f"{_MATRIX} + {_fibres('f')}", _FOUR_VOLUMES, f"{_MEAN}\n{_TENSION}"
-    ),
-    "holzapfel_ogden_dispersed_unswitched": _form(
-        "x f", f"{_MATRIX} + {_fibres('f')}", _FOUR_VOLUMES, _MEAN
-    ),
-    "holzapfel_ogden_orthotropic": _form(
-        "x f s g",
-        f"{_MATRIX} + {_fibres('f')} + {_fibres('s')}"
-        " + a_fs / (2 * b_fs) * (tm.exp(b_fs * g**2) - 1)",
-        _FOUR_VOLUMES,
-        f"{_TENSION}\ns = tm.maximum(s, 0.0)",
-    ),
+    "holzapfel_ogden": _form("x f", _PARALLEL, _FOUR_VOLUMES, _TENSION),
+    "holzapfel_ogden_unswitched": _form("x f", _PARALLEL, _FOUR_VOLUMES),
+    "holzapfel_ogden_released": _form("x f", f"2 * ({_PARALLEL})", _FOUR_VOLUMES),
+    "holzapfel_ogden_dispersed": _form("x f", _PARALLEL, _FOUR_VOLUMES, f"{_MEAN}\n{_TENSION}"),
+    "holzapfel_ogden_dispersed_unswitched": _form("x f", _PARALLEL, _FOUR_VOLUMES, _MEAN),
+    "holzapfel_ogden_orthotropic": _form("x f s g", _ORTHOTROPIC, _FOUR_VOLUMES, _BOTH_TENSIONS),
     "holzapfel_gasser_ogden": _form("x f s g", _ARTERY, before=_FAMILIES.format("0.0")),
     "gasser_ogden_holzapfel": _form("x f s g", _ARTERY, before=_FAMILIES.format("dispersion")),
     "guccione": _form("ff", "C / 2 * (tm.exp(Q) - 1)", "kappa / 2 * (J - 1) ** 2", _Q_GUCCIONE),

@@ -15,8 +15,11 @@ Both have the energies
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 
-from emulator.neighbours.cards.card import ExportedBody, Form, Values, digits, row
+import numpy as np
+
+from emulator.neighbours.cards.card import ExportedBody, Form, Values, digits, engineering, row
 
 PER_KPA = 1e-3
 """Moduli in MPa for one of 1 kPa."""
@@ -68,8 +71,7 @@ def isotropic_forms(unused: float) -> Mapping[str, Form]:
         return deck("TISSUE", ["*ELASTIC", *data([PER_KPA * E, nu])])
 
     def lame(v: Values) -> str:
-        mu, lam = v["mu"], v["lam"]
-        return elastic(mu * (3.0 * lam + 2.0 * mu) / (lam + mu), lam / (2.0 * (lam + mu)))
+        return elastic(*engineering(v["mu"], v["lam"]))
 
     return {
         "neo_hookean_split": Form(neo_hookean, penalty=SQUARE),
@@ -97,7 +99,20 @@ def mesh_lines(body: ExportedBody) -> list[str]:
     return lines
 
 
-def distribution_lines(vectors: Iterable[Iterable[float]]) -> list[str]:
-    """Return the lines of a distribution of two vectors (6 numbers) over elements."""
-    first = ", 1., 0., 0., 0., 1., 0."
-    return [first, *(f"{k}, {row(six)}" for k, six in enumerate(vectors, start=1))]  # type: ignore[arg-type]
+def write_deck(
+    folder: Path, body: ExportedBody, material: str, axes: np.ndarray | None, head: Sequence[str]
+) -> list[str]:
+    """Write ``body.inp``: mesh, sets and axes, with the material of ``mean.inp``.
+
+    material : its name.
+    axes : the six components (m, 6) of two vectors of each element; None without fibres.
+    head : the lines that begin the distribution of these.
+    """
+    lines, section = mesh_lines(body), f"*SOLID SECTION, ELSET=BODY, MATERIAL={material}"
+    if axes is not None:
+        lines += [*head, ", 1., 0., 0., 0., 1., 0."]
+        lines += [f"{k}, {row(six)}" for k, six in enumerate(axes, start=1)]
+        section += ", ORIENTATION=FIBRES"
+    lines += ["*INCLUDE, INPUT=mean.inp", section]
+    (folder / "body.inp").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return ["body.inp"]

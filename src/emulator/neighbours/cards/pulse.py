@@ -26,7 +26,14 @@ from typing import Any
 import meshio
 import numpy as np
 
-from emulator.neighbours.cards.card import ExportedBody, Form, Program, Values
+from emulator.neighbours.cards.card import (
+    ISOCHORIC_NEO_HOOKEAN,
+    OTHER_GUCCIONE,
+    ExportedBody,
+    Form,
+    Program,
+    Values,
+)
 
 _SWITCH_OFF = ["use_subplus=False", "use_heaviside=False"]
 
@@ -121,10 +128,7 @@ PULSE = Program(
     suffix=".py",
     units="mm, kPa (pulse converts; give its problem mesh_unit mm)",
     forms=_FORMS,
-    refusals={
-        "guccione": "its Guccione energy is of the isochoric strain, so that forces would differ",
-        **dict.fromkeys(("neo_hookean", "neo_hookean_E_nu"), "its neo-Hookean energy is isochoric"),
-    },
+    refusals={**OTHER_GUCCIONE, **ISOCHORIC_NEO_HOOKEAN},
     write_body=write_body,
     usage="A card is a module: `from mean import material, compressibility`. `case.py` builds "
     "mesh, directions and model of any card; give `StaticProblem` the `mesh_unit` `mm`.",

@@ -30,7 +30,15 @@ from pathlib import Path
 import meshio
 import numpy as np
 
-from emulator.neighbours.cards.card import ExportedBody, Form, Program, Values, digits
+from emulator.neighbours.cards.card import (
+    ISOCHORIC_NEO_HOOKEAN,
+    OTHER_GUCCIONE,
+    ExportedBody,
+    Form,
+    Program,
+    Values,
+    digits,
+)
 
 SHARP = 1e3
 """The k of the switch: larger ones overflow at stretches of 1.3."""
@@ -130,8 +138,8 @@ SVMULTIPHYSICS = Program(
             ("holzapfel_gasser_ogden", "gasser_ogden_holzapfel"),
             "its arterial fibres resist compression, too, so that forces would differ",
         ),
-        "guccione": "its Guccione energy is of the isochoric strain, so that forces would differ",
-        **dict.fromkeys(("neo_hookean", "neo_hookean_E_nu"), "its neo-Hookean energy is isochoric"),
+        **OTHER_GUCCIONE,
+        **ISOCHORIC_NEO_HOOKEAN,
     },
     write_body=write_body,
     usage='Put a card\'s elements into `Add_equation type="struct"`, `body.vtu` and both '
