@@ -20,13 +20,7 @@ from __future__ import annotations
 from math import cos, radians, sin
 from pathlib import Path
 
-from emulator.neighbours.cards.card import (
-    ISOCHORIC_NEO_HOOKEAN,
-    ExportedBody,
-    Form,
-    Program,
-    Values,
-)
+from emulator.neighbours.cards.card import SPLIT, ExportedBody, Form, Program, Values
 from emulator.neighbours.cards.inp import PER_KPA, data, deck, isotropic_forms, write_deck
 
 
@@ -71,7 +65,7 @@ ABAQUS = Program(
     },
     refusals={
         **dict.fromkeys(("guccione", "fung_orthotropic", "fung_planar"), _ISOCHORIC),
-        **ISOCHORIC_NEO_HOOKEAN,
+        **SPLIT,
     },
     write_body=write_body,
     usage="`*INCLUDE, INPUT=mean.inp` reads a card; `body.inp` does, and needs a step. Cards with "

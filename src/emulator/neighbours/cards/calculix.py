@@ -22,13 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from emulator.neighbours.cards.card import (
-    ISOCHORIC_NEO_HOOKEAN,
-    ExportedBody,
-    Form,
-    Program,
-    Values,
-)
+from emulator.neighbours.cards.card import SPLIT, ExportedBody, Form, Program, Values
 from emulator.neighbours.cards.inp import PER_KPA, SQUARE, data, deck, isotropic_forms, write_deck
 
 _FIBRE_NAME = "ELASTIC_FIBER_TISSUE"
@@ -66,7 +60,7 @@ CALCULIX = Program(
     },
     refusals={
         "gasser_ogden_holzapfel": "its fibres are not dispersed",
-        **ISOCHORIC_NEO_HOOKEAN,
+        **SPLIT,
     },
     write_body=write_body,
     usage="`*INCLUDE, INPUT=mean.inp` reads a card; `body.inp` does, and needs a step. Cards with "

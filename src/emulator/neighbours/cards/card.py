@@ -31,14 +31,8 @@ LEAST_RATIO = 20.0
 
 Values = Mapping[str, float]
 """Parameters of a law by name, in the law's units."""
-ISOCHORIC_NEO_HOOKEAN = dict.fromkeys(
-    ("neo_hookean", "neo_hookean_E_nu"), "its neo-Hookean energy is isochoric"
-)
-"""The refusal of compressible neo-Hookean laws by programs that split all of their energies."""
-OTHER_GUCCIONE = {
-    "guccione": "its Guccione energy is of the isochoric strain, so that forces would differ"
-}
-"""The refusal by programs that split Guccione's energy as well."""
+SPLIT = dict.fromkeys(("neo_hookean", "neo_hookean_E_nu"), "its neo-Hookean energy is isochoric")
+"""The refusals of compressible laws by programs that split every energy."""
 
 
 @dataclass(frozen=True)
