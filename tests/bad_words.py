@@ -31,6 +31,8 @@ COMMANDS = [
         "frames left_ventricle --field none.csv --amount pressure=p.csv --out frames.csv",
         "--amount 'pressure=p.csv'; give PARAMETER=FILE:COLUMN",
     ),
+    ("export none --to febio --out x", "run.json does not exist: there is no such folder"),
+    ("export none --to ansys --out x", "program 'ansys' is unknown; known: febio, abaqus"),
     ("simulate beam", "scene 'beam' is unknown"),
     ("simulate missing.toml", "missing.toml does not exist"),
     ("simulate once_clamped_beam --theta mu=500 lam=60", "parameter 'mu' is 500 kPa"),

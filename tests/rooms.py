@@ -45,8 +45,12 @@ ROOMS = {
         "calibrate.cli.commands.cohort",
     ),
     "external": ("emulator.external", "calibrate.external"),
-    "neighbours": ("emulator.neighbours",),
     "predictions": ("calibrate.prediction", "calibrate.cli.commands.prediction"),
+    "neighbours": (
+        "emulator.neighbours",
+        "calibrate.neighbours",
+        "calibrate.cli.commands.export",
+    ),
     "released": (
         "emulator.released",
         "emulator.verify",

@@ -16,6 +16,7 @@ from calibrate.noise import NOISES
 from calibrate.samplers import SAMPLERS
 from emulator.fem.formulations import FORMULATIONS
 from emulator.mechanics.laws import LAWS
+from emulator.neighbours.cards import PROGRAMS
 from emulator.scenes.loads import LOADS
 from emulator.scenes.supports import SUPPORTS
 from emulator.surrogates.registry import FORWARD_MAPS
@@ -30,6 +31,7 @@ REGISTRIES = {
     "a noise": NOISES,
     "a sampler": SAMPLERS,
     "a formulation": FORMULATIONS,
+    "a program to export to": PROGRAMS,
 }
 
 

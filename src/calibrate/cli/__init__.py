@@ -38,6 +38,7 @@ COMMANDS = {
     "effects": "analyses",
     "evaluate": "evaluate",
     "explore": "serving",
+    "export": "export",
     "frames": "frames",
     "identify": "analyses",
     "infer": "posteriors",

@@ -1,1 +1,1 @@
-"""A room: other programs' input decks become scenes, and calibrated scenes become their cards."""
+"""Neighbours: decks of other finite element programs, and laws and bodies in their forms."""

@@ -33,6 +33,7 @@ WORDS = [
     "effects scene.toml --observe nodes:4 --tolerance 0.1mm --samples 2",
     "evaluate once_clamped_beam --against fem --cases 2",
     "explore once_clamped_beam --no-browser",
+    "export one --to felupe --mesh --out cards",
     "frames left_ventricle --surface endocardium@a=endo.stl --points 5 --out frames.csv",
     f"identify before {BEAM}",
     "identify after one --next nodes:4",
