@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -81,14 +81,17 @@ def draft_of_table(table: Path, out: Path, inputs: Sequence[str]) -> TableDraft:
         raise InputError(f"{table}: no {'outputs' if parameters else 'parameters'}; see --inputs")
     renamed = {name: word for name, word in columns.items() if name != word}
     notes += [f"column '{word}' is called {name}" for name, word in list(renamed.items())[:5]]
+    out.write_text("\n".join([_head(table, renamed), *blocks]), encoding="utf-8")
+    return TableDraft(out, parameters, outputs, notes)
+
+
+def _head(table: Path, renamed: Mapping[str, str]) -> str:
+    """Return the first lines of the file; ``renamed`` has columns by their names in it."""
     entries = ", ".join(f"{name} = {json.dumps(word)}" for name, word in renamed.items())
-    head = (
+    return (
         "# A table of runs as a problem: calibrate infer FILE --data DATA.csv --noise OUTPUT=SD\n"
         f'[solver]\nkind = "table"\nfile = {json.dumps(table.name)}\n'
-    )
-    head += f"columns = {{ {entries} }}\n" if renamed else ""
-    out.write_text("\n".join([head, *blocks]), encoding="utf-8")
-    return TableDraft(out, parameters, outputs, notes)
+    ) + (f"columns = {{ {entries} }}\n" if renamed else "")
 
 
 def _chosen(runs: RunTable, inputs: Sequence[str]) -> list[str]:
