@@ -168,7 +168,7 @@ def left_ventricle(
     cavity, notes = largest_piece(image, blood, "blood")
     wall = image.mask(myocardium)
     whole, more = largest_piece(image, [*blood, *myocardium], "blood and myocardium")
-    if not (wall & whole).any():
+    if not ((wall & whole).any() and (cavity & whole).any()):
         raise InputError(f"{image.name}: no voxel of the myocardium touches the blood")
     inner = mask_surface(image, cavity, "endocardium", blur)
     outer = mask_surface(image, whole | cavity, "epicardium", blur)

@@ -84,7 +84,7 @@ def mesh_solid(
     skin = smoothed(surface_in_mm(source, "surface", unit), smooth)
     if skin.rims:
         raise InputError(
-            f"surface: it has {len(skin.rims)} openings; expected it closed, around the whole body"
+            f"surface: it is open, with {len(skin.rims)} rims; expected it closed around the body"
         )
     if size is not None and not 0.0 < size < skin.extent / 4.0:
         raise InputError(

@@ -12,7 +12,7 @@ from emulator.geometry.generators.ellipsoid import HUMAN
 from emulator.geometry.io import read_mesh
 from emulator.hearts.images import label_image, read_labels
 from emulator.hearts.segmentation import label_surface, left_ventricle
-from surface_support import INSIDE, OUTSIDE
+from surface_support import INSIDE, OUTSIDE, ellipsoid, write
 
 MIDDLE = np.array([31.0, -24.0, 12.0])
 TURN = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
@@ -188,6 +188,10 @@ def test_a_ventricle_without_an_open_base_or_with_a_hole(lv):
     around = label_image("lv", ventricle(affine, shape, 90.0), affine)
     with pytest.raises(InputError, match="the myocardium is all around the blood"):
         left_ventricle(around, [1], [2])
+    apart = np.where(lv.labels == 1, 1, 0)
+    apart[2:5, 2:5, 2:5] = 2
+    with pytest.raises(InputError, match="no voxel of the myocardium touches the blood"):
+        left_ventricle(label_image("lv", apart, lv.affine), [1], [2])
     with pytest.raises(InputError, match=r"--blood 2 is a label of --myocardium, too"):
         left_ventricle(lv, [2], [2])
 
@@ -288,6 +292,20 @@ def test_an_organ_becomes_a_mesh(tmp_path, capsys):
     assert len(mesh.facet_set("surface")) == len(mesh.surface)
     short = complaint(capsys, "mesh", "--image", tmp_path / "a.nii", "--label", 5, "--size", 90, "--out", out)  # fmt: skip
     assert "below a quarter of the body's extent" in short
+
+
+def test_a_closed_surface_becomes_a_mesh(tmp_path, capsys):
+    pytest.importorskip("gmsh", reason="no gmsh here", exc_type=(ImportError, OSError))
+    write(tmp_path / "body.stl", 0.1 * ellipsoid((15.0, 22.0)))
+    words = "mesh", "--surface", tmp_path / "body.stl", "--out", tmp_path / "body.vtu"
+    code, told = answer(capsys, *words, "--unit", "cm", "--order", 1, "--size", 5)
+    assert code == 0
+    exact = 4.0 / 3.0 * np.pi * 15.0**2 * 22.0 / 1000.0
+    assert told["volume"]["surface"] == pytest.approx(exact, rel=0.03)
+    assert told["volume"]["mesh"] == pytest.approx(exact, rel=0.05)
+    soup = ellipsoid((15.0, 22.0))
+    write(tmp_path / "body.stl", soup[soup[:, :, 2].max(axis=1) < 10.0])
+    assert "surface: it is open, with 1 rims; expected it closed" in complaint(capsys, *words)
 
 
 def test_a_ventricle_becomes_a_wall(lv, tmp_path, capsys):
