@@ -132,6 +132,31 @@ def tetrahedralise(
         return _cells(gmsh, 4)
 
 
+def tetrahedralise_anew(
+    points: np.ndarray, triangles: np.ndarray, size: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return nodes (n', 3) mm and elements (m, 4) within a closed surface, with new triangles.
+
+    Gmsh cuts the surface into patches that it can lay out in a plane, and meshes these evenly.
+
+    points, triangles : (n, 3) mm and (t, 3), normals pointing out. size : edge length, mm.
+    """
+    with _model() as gmsh:
+        skin = gmsh.model.addDiscreteEntity(2)
+        gmsh.model.mesh.addNodes(2, skin, np.arange(1, len(points) + 1), points.ravel())
+        gmsh.model.mesh.addElementsByType(skin, _TYPES[3], [], (triangles + 1).ravel())
+        gmsh.model.mesh.classifySurfaces(np.pi, True, True, np.pi)
+        gmsh.model.mesh.createGeometry()
+        patches = [tag for _, tag in gmsh.model.getEntities(2)]
+        gmsh.model.geo.addVolume([gmsh.model.geo.addSurfaceLoop(patches)])
+        gmsh.model.geo.synchronize()
+        gmsh.option.setNumber("Mesh.MeshSizeMin", size)
+        gmsh.option.setNumber("Mesh.MeshSizeMax", size)
+        gmsh.option.setNumber("Mesh.OptimizeNetgen", 1)
+        gmsh.model.mesh.generate(3)
+        return _cells(gmsh, 4)
+
+
 def _cells(gmsh: Any, corners: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the nodes in the order of their tags, and the elements; input nodes come first."""
     tags, places, _ = gmsh.model.mesh.getNodes()
