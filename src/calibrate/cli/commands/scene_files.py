@@ -393,9 +393,8 @@ def _card_in_words(card: dict[str, Any]) -> str:
     """Return a card as lines that fit a terminal, without what its training did not record."""
     counts = {"fem_runs": "FEM runs", "sweeps": "sweeps", "steps": "steps", "bodies": "bodies"}
     trained = [f"recipe {card['recipe']}", f"seed {card['seed']}"]
-    trained += [
-        f"{card[key]} {noun}" for key, noun in counts.items() if card[key] or key == "fem_runs"
-    ]
+    known = {key: n for key in counts if (n := card[key]) or (n == 0 and key == "fem_runs")}
+    trained += [f"{number} {counts[key]}" for key, number in known.items()]
     machine = card["hardware"] or {}
     if card["seconds"] is not None:
         cores = f" on {machine['cores']} cores" if "cores" in machine else ""
