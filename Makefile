@@ -14,7 +14,8 @@ OLDEST_TESTS := tests/test_package.py $(addprefix tests/emulator/,mechanics scen
 	training core/test_schema.py core/test_store.py) $(addprefix tests/calibrate/,samplers certificate cli/test_cli.py \
 	analysis/test_sensitivity.py report posterior/test_tree.py measurements/test_data.py project/test_demo.py)
 
-.PHONY: demo test nightly test-slow test-studies test-oldest package notebooks pictures docs lint format study clean
+.PHONY: demo test nightly test-slow test-studies test-oldest package release notebooks pictures \
+	docs lint format study clean
 
 demo: $(STAMP)
 	@$(BIN)/calibrate demo --out $(OUT)
@@ -45,6 +46,12 @@ package: $(STAMP)
 	rm -rf dist
 	$(BIN)/python -m build
 	$(BIN)/python tests/package_check.py dist
+
+# Versions agree, and what is built works elsewhere: make release, of a tag make release TAG=v0.1.0.
+release: $(STAMP)
+	$(BIN)/python tests/release_check.py "$$TAG"
+	$(MAKE) package
+	@ls -sh1 dist
 
 notebooks: $(STAMP)
 	$(BIN)/python -m pytest tests/test_notebooks.py

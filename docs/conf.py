@@ -28,6 +28,7 @@ myst_heading_anchors = 3
 exclude_patterns = ["_build"]
 html_theme = "furo"
 html_title = project
+html_extra_path = ["llms.txt"]
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"
 napoleon_numpy_docstring = True
@@ -147,6 +148,14 @@ def _entries(_app, _what, _name, _thing, _options, lines):
     lines[:] = found
 
 
+def _sources(app, error):
+    """Copy the pages' Markdown to the root of the site, where llms.txt links it."""
+    if error is None:
+        for path in HERE.glob("*.md"):
+            shutil.copy(path, app.outdir)
+
+
 def setup(app):
     """Sphinx calls this."""
+    app.connect("build-finished", _sources)
     app.connect("autodoc-process-docstring", _entries, priority=1)  # before napoleon

@@ -3,6 +3,7 @@
 import ast
 import inspect
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -11,9 +12,12 @@ import pytest
 
 import calibrate
 import emulator
+from calibrate.cli import build_parser
 from calibrate.model_error.kinds import SYSTEMATIC_ERRORS
 
 ROOT = Path(__file__).parents[1]
+FRONT = ("AGENTS.md", "CONTRIBUTING.md", "docs/llms.txt")
+"""Pages for those who come to the repository, besides README.md and docs/*.md."""
 
 
 @pytest.mark.parametrize("package", [emulator, calibrate], ids=lambda p: p.__name__)
@@ -48,10 +52,14 @@ def test_the_site_builds_without_a_warning(tmp_path):
     for name in calibrate.__all__:
         if not inspect.ismodule(getattr(calibrate, name)):
             assert f'id="calibrate.{name}"' in page, name
+    for path in (ROOT / "docs").glob("*.md"):  # as llms.txt links them
+        assert (tmp_path / path.name).read_bytes() == path.read_bytes()
+    assert (tmp_path / "llms.txt").is_file()
 
 
 def test_no_line_of_prose_is_wider_than_100_characters():
-    for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
+    front = [ROOT / page for page in ("README.md", *FRONT)]
+    for path in [*front, *(ROOT / "docs").glob("*.md")]:
         if path.name == "experiments.md":  # the log of what was tried keeps its lines
             continue
         text = re.sub(r"```.*?```", "", path.read_text(encoding="utf-8"), flags=re.DOTALL)
@@ -62,7 +70,8 @@ def test_no_line_of_prose_is_wider_than_100_characters():
 
 def test_docs_and_notebooks_import_from_the_two_packages_only():
     """A user's code needs no module's path; a page shows files of the package with their docstring."""
-    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
+    front = [ROOT / page for page in ("README.md", *FRONT)]
+    pages = [*front, *(ROOT / "docs").glob("*.md")]
     code = {}
     for path in pages:
         blocks = examples(path.relative_to(ROOT))
@@ -83,6 +92,57 @@ def test_docs_and_notebooks_import_from_the_two_packages_only():
 
 def test_the_readme_is_short():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 120
+
+
+def test_contributing_is_short():
+    assert len((ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8").splitlines()) <= 60
+
+
+@pytest.mark.parametrize("page", ["README.md", *FRONT])
+def test_links_of_the_front_pages_lead_somewhere(page):
+    path = ROOT / page
+    links = re.findall(r"\]\((?!https?:)([^)#]+)\)", path.read_text(encoding="utf-8"))
+    assert [link for link in links if not (path.parent / link).exists()] == []
+
+
+def test_llms_txt_has_the_form_of_llmstxt_org_and_every_page():
+    text = (ROOT / "docs" / "llms.txt").read_text(encoding="utf-8")
+    head, *sections = re.split(r"^## ", text, flags=re.MULTILINE)
+    assert re.match(r"# [^\n]+\n\n> ", head)
+    entries = [line for section in sections for line in section.splitlines()[1:] if line]
+    names = [re.fullmatch(r"- \[[^\]]+\]\((\w+)\.md\): .+", line)[1] for line in entries]
+    assert sorted(names) == sorted({p.stem for p in (ROOT / "docs").glob("*.md")} - {"index"})
+
+
+def shell_lines(page):
+    """Commands of a page's shell blocks, words as a shell splits them, without comments."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    blocks = re.findall(r"^```([^\n]*)\n(.*?)^```$", text, flags=re.DOTALL | re.MULTILINE)
+    lines = "".join(block for language, block in blocks if language in ("", "sh"))
+    lines = lines.replace("\\\n", " ")
+    commands = [shlex.split(line, comments=True) for line in lines.splitlines()]
+    return [words for words in commands if words]
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/quickstart.md", *FRONT])
+def test_command_lines_are_words_that_the_commands_know(page):
+    """Commands of this package are parsed; targets, modules and files of the others exist."""
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    lines = shell_lines(page)
+    assert lines
+    for words in lines:
+        words = [word for word in words if not re.match(r"[A-Z_]+=", word)]
+        if words[0] == "calibrate":
+            build_parser(words[1]).parse_args(words[1:])
+        elif words[0] == "make" and words[1] != ".venv/.installed":
+            assert re.search(rf"^{words[1]}:", makefile, flags=re.MULTILINE), words
+        elif words[0].endswith("python"):
+            places = [word.replace(".", "/") + ".py" for word in words if "tests." in word]
+            places += [word for word in words if word.startswith("tests/")]
+            assert all((ROOT / place).exists() for place in places), words
+            assert places, words
+        else:
+            assert words[0] in ("git", "make", "pip"), words
 
 
 OWN_TESTS = {"README.md", "docs/extending.md", "docs/ecosystem.md"}
@@ -134,7 +194,11 @@ LONG = (
 
 
 @pytest.mark.parametrize(
-    "page", [pytest.param(p, marks=pytest.mark.slow if Path(p).stem in LONG else ()) for p in PAGES]
+    "page",
+    [
+        *FRONT,
+        *(pytest.param(p, marks=pytest.mark.slow if Path(p).stem in LONG else ()) for p in PAGES),
+    ],
 )
 def test_the_quick_examples_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -160,8 +224,9 @@ def test_the_examples_that_take_long_run(page, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_examples_of_the_readme_run(capsys):
-    run_examples("README.md")
+@pytest.mark.parametrize("page", ["README.md", "AGENTS.md"])
+def test_the_examples_of_the_first_pages_run(page, capsys):
+    run_examples(page)
     assert "accepted" in capsys.readouterr().out
 
 

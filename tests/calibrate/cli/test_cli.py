@@ -41,6 +41,21 @@ def test_scenes(capsys):
     assert "stiffness_1 ... stiffness_17 0.5 to 2" in "\n".join(lines)
 
 
+def test_one_scene_has_the_cards_of_its_emulators(capsys):
+    code, (beam,) = answer(capsys, "scenes", "once_clamped_beam")
+    assert code == 0
+    assert [card["name"] for card in beam["cards"]] == beam["emulators"]
+    assert beam["cards"][2]["fem_runs"] == 201
+    code, (card,) = answer(capsys, "scenes", "ventricle_family")
+    assert (code, card["scene"], card["bodies"]) == (0, "left_ventricle", 789)
+    assert main(["scenes", "once_clamped_beam"]) == 0
+    text = capsys.readouterr().out
+    assert "Newton's step at unseen theta: max 1.6e-07 mm" in text
+    assert text.count("licence  MIT") == 3
+    assert answer(capsys, "scenes", "turned_beam")[1][0]["cards"] == []
+    assert "did you mean 'once_clamped_beam'?" in complaint(capsys, "scenes", "once_clamped")
+
+
 def test_simulate(capsys, block, tmp_path):
     out = tmp_path / "u.vtu"
     code, result = answer(capsys, "simulate", block, "--theta", "mu=7", "--out", out)

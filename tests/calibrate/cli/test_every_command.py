@@ -45,6 +45,7 @@ WORDS = [
     "released Liver --root PUBLISHED --out liver",
     "report one --no-fem",
     "scenes",
+    "scenes ventricle_family",
     "schema",
     "schema experiment",
     "sensitivity once_clamped_beam --observe nodes:4 --samples 8",

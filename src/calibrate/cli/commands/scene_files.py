@@ -437,21 +437,40 @@ def _mesh_wall(arguments: Namespace) -> Answer:
 _WIDTH = 79
 
 
-@command(help="what is built in")
-def scenes(arguments: Namespace) -> Answer:  # noqa: ARG001
-    """List the built-in scenes and the emulators shipped for them."""
+@command(
+    option(
+        "name",
+        "SCENE|EMULATOR",
+        "one scene, with the card of each emulator shipped for it, or one emulator",
+        nargs="?",
+    ),
+    help="what is built in; of one, the cards of its emulators",
+    description="Lists the built-in scenes and the emulators shipped for them. Of one it prints "
+    "the emulators' cards: what they are, how they were trained and over which theta, the errors "
+    "that their training recorded, the licence and the digest of their weights.",
+    epilog="example: calibrate scenes left_ventricle",
+)
+def scenes(arguments: Namespace) -> Answer:
+    """List the built-in scenes and the emulators shipped for them, or describe one of either."""
+    from emulator.core.errors import check_known
     from emulator.core.store import read_json
     from emulator.scenes import BUILT_IN
     from emulator.surrogates.folders import SHIPPED, shipped
 
     origins = {name: read_json(SHIPPED / name / "emulator.json")["scene"] for name in shipped()}
+    name = arguments.name
+    if name is not None:
+        if not (SHIPPED / name / "emulator.json").is_file():
+            check_known(name, sorted({*BUILT_IN, *origins}), "scene or emulator")
+        if name not in BUILT_IN:
+            return _cards([name])
     rows: list[dict[str, Any]] = []
-    for name, make in sorted(BUILT_IN.items()):
-        scene = make()
-        emulators = [n for n, origin in origins.items() if origin.get("scene") == name]
+    for scene_name in sorted(BUILT_IN) if name is None else [name]:
+        scene = BUILT_IN[scene_name]()
+        emulators = [n for n, origin in origins.items() if origin.get("scene") == scene_name]
         rows.append(
             {
-                "name": name,
+                "name": scene_name,
                 "nodes": len(scene.mesh.nodes),
                 "elements": len(scene.mesh.elements),
                 "law": scene.law.name,
@@ -459,11 +478,52 @@ def scenes(arguments: Namespace) -> Answer:  # noqa: ARG001
                     {"name": p.name, "unit": p.unit, "low": p.low, "high": p.high, "scale": p.scale}
                     for p in scene.parameters
                 ],
-                "emulator_shipped": name in emulators,
+                "emulator_shipped": scene_name in emulators,
                 "emulators": emulators,
             }
         )
-    return Answer(rows, _scenes_in_words(rows))
+    if name is None:
+        return Answer(rows, _scenes_in_words(rows))
+    cards = _cards(rows[0]["emulators"])
+    text = "\n\n".join(filter(None, (_scenes_in_words(rows), cards.text)))
+    return Answer([rows[0] | {"cards": cards.result}], text)
+
+
+def _cards(names: list[str]) -> Answer:
+    """Return the cards of shipped emulators."""
+    from emulator.surrogates.card import model_card
+
+    cards = [model_card(name)._asdict() for name in names]
+    return Answer(cards, "\n\n".join(map(_card_in_words, cards)))
+
+
+def _card_in_words(card: dict[str, Any]) -> str:
+    """Return a card as lines that fit a terminal, without what its training did not record."""
+    counts = {"fem_runs": "FEM runs", "sweeps": "sweeps", "steps": "steps", "bodies": "bodies"}
+    trained = [f"recipe {card['recipe']}", f"seed {card['seed']}"]
+    known = {key: n for key in counts if (n := card[key]) or (n == 0 and key == "fem_runs")}
+    trained += [f"{number} {counts[key]}" for key, number in known.items()]
+    machine = card["hardware"] or {}
+    if card["seconds"] is not None:
+        cores = f" on {machine['cores']} cores" if "cores" in machine else ""
+        trained.append(f"{card['seconds']:.0f} s{cores}")
+    errors = [
+        f"{e['quantity'].partition(',')[0]} at {e['where']}: {e['statistic']} {e['value']:.2g}"
+        f"{e['quantity'].partition(',')[2]}"
+        for e in card["errors"]
+    ]
+    lines = [f"{card['name']}, an emulator of {card['scene']}"]
+    for title, entries in {
+        "parts": card["parts"],
+        "trained": trained,
+        "theta": _parameters(card["theta"]),
+        "error": errors or ["not recorded"],
+        "licence": [card["licence"] or "none stated"],
+    }.items():
+        lines += _wrapped(title.ljust(7), entries)
+    lines += [f"  made by  {card['command']}"] if card["command"] else []
+    lines += [] if errors else [f"  error by calibrate evaluate {card['name']} --against fem"]
+    return "\n".join([*lines, f"  sha256   {card['weights_sha256']}"])
 
 
 def _scenes_in_words(rows: list[dict[str, Any]]) -> str:
@@ -550,6 +610,7 @@ def completion(arguments: Namespace) -> Answer:
         "SCENE": _words([*BUILT_IN], "toml"),
         "EMULATOR": _words(shipped()),
         "NAME|DIR": _words([*KINDS, *shipped()]),
+        "SCENE|EMULATOR": _words(sorted({*BUILT_IN, *shipped()})),
         "DIR|fem": _words(["fem"]),
         "synthetic": _words(["synthetic"], "csv"),
     }
