@@ -43,7 +43,7 @@ _ENDS = 0.02  # of the field's maximum, from either end: levels that are tried
 _MISSED = 1e-3  # of the volume, by which a surface may miss that of its voxels
 
 
-class SegmentedVentricle(NamedTuple):
+class VentricleSurfaces(NamedTuple):
     """Closed surfaces of a left ventricle, and its base plane.
 
     axis : (3,) from apex to base, of length 1. base : (3,) mm, a point of the base plane.
@@ -149,7 +149,7 @@ def left_ventricle(
     blood: Sequence[int],
     myocardium: Sequence[int],
     blur: float | None = None,
-) -> SegmentedVentricle:
+) -> VentricleSurfaces:
     """Return closed surfaces of a left ventricle, its long axis and its base plane.
 
     Parameters
@@ -173,7 +173,7 @@ def left_ventricle(
     inner = mask_surface(image, cavity, "endocardium", blur)
     outer = mask_surface(image, whole | cavity, "epicardium", blur)
     axis, base, last = _base_plane(image, cavity, whole | cavity, blur)
-    return SegmentedVentricle(inner, outer, axis, base, (*image.notes, *notes, *more, *last))
+    return VentricleSurfaces(inner, outer, axis, base, (*image.notes, *notes, *more, *last))
 
 
 def _base_plane(
