@@ -22,7 +22,9 @@ IMPORTS = """
 import importlib, pkgutil, sys
 import calibrate, emulator
 for package in (emulator, calibrate):
-    for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+    # A package that lacks its extra is judged below; without onerror the walk would raise as well.
+    modules = pkgutil.walk_packages(package.__path__, package.__name__ + ".", onerror=lambda _: None)
+    for module in modules:
         try:
             importlib.import_module(module.name)
         except ModuleNotFoundError as error:  # of the extra "plot"

@@ -24,8 +24,6 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
-from trimesh import transform_points
-from trimesh.geometry import plane_transform
 
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import mesh_quality
@@ -44,6 +42,14 @@ from emulator.hearts.surfaces import (
     rim_loops,
 )
 from emulator.hearts.wall import fill
+
+try:
+    from trimesh import transform_points
+    from trimesh.geometry import plane_transform
+except ModuleNotFoundError as error:
+    raise InputError(
+        "surfaces need trimesh: pip install 'soft-tissue-calibrate[surfaces]'"
+    ) from error
 
 LEFT, RIGHT, EPICARDIUM = BOTH
 VALVES: Mapping[str, tuple[str, ...]] = {
