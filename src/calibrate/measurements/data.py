@@ -28,7 +28,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibrate.measurements import kinds_of
+from calibrate.measurements import OBSERVATIONS, kinds_of
 from calibrate.measurements.collection import Observations, check_some, observations
 from calibrate.measurements.observation import (
     Block,
@@ -100,7 +100,8 @@ def _observed(
     scene: ForwardProblem, file: DataTable, state: str
 ) -> dict[str, tuple[Observation, np.ndarray]]:
     """Return the observations of one load state and their data, by name."""
-    layouts, observed = _layouts(file, kinds_of(scene)), {}
+    kinds = kinds_of(scene) if scene.outside else OBSERVATIONS
+    layouts, observed = _layouts(file, kinds), {}
     for base, (kind, layout) in layouts.items():
         name, places = in_state(base, state), _words(layout, where=True)
         sharing = [other for _, other in layouts.values() if places & _words(other, where=True)]

@@ -34,6 +34,8 @@ from tqdm import tqdm
 from emulator.core.errors import InputError, SolverError
 from emulator.core.machine import cores, one_blas_thread
 
+THREADS = "threads"
+"""The word of the threads of this process."""
 USAGE = "threads, processes:N or dask:ADDRESS"
 """The words of an engine."""
 SENT_ONCE = "sent_once"
@@ -272,7 +274,7 @@ def check_engine(words: str) -> tuple[str, str]:
     """Return the kind of an engine and what it is of; :class:`InputError` for other words."""
     kind, _, rest = words.partition(":")
     counted = kind == "processes" and rest.isascii() and rest.isdigit() and int(rest) > 0
-    if words != "threads" and not counted and not (kind == "dask" and rest):
+    if words != THREADS and not counted and not (kind == "dask" and rest):
         raise InputError(f"engine '{words}': give {USAGE}")
     return kind, rest
 
@@ -282,7 +284,7 @@ def engine_of(executor: Executor | str | None) -> Engine | None:
 
     :class:`InputError` for other words, or where what they name is not installed or not there.
     """
-    if executor is None or executor == "threads":
+    if executor is None or executor == THREADS:
         return None
     if not isinstance(executor, str):
         if not callable(getattr(executor, "submit", None)):
