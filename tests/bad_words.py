@@ -9,7 +9,8 @@ COMMANDS = [
         "'mu' is no modulus on a uniform scale",
     ),
     ("mesh --endocardium none.stl --epicardium no.stl --out lv.vtu", "none.stl does not exist"),
-    ("mesh --endocardium none.stl", "arguments are required: --epicardium, --out"),
+    ("mesh --endocardium none.stl", "arguments are required: --out"),
+    ("mesh --endocardium none.stl --out lv.vtu", "give --endocardium and --epicardium of a wall"),
     (
         "mesh --endocardium none.stl --epicardium no.stl --out lv.xyz",
         "--out lv.xyz: the file name must end in .vtu",
@@ -161,7 +162,7 @@ COMMANDS = [
     ("train nowhere --out x", "scene 'nowhere' is unknown; built in:"),
     ("train liver", "are required: --out"),
     ("evaluate once_clamped_beam", "are required: --against"),
-    ("scenes luck", "unrecognized arguments: luck"),
+    ("scenes luck", "scene or emulator 'luck' is unknown; known: "),
     ("simulate once_clamped_beam --load-steps 0", "0 load steps; give 1 or more"),
     ("simulate once_clamped_beam --theta mu=inf lam=60", "mu' is inf kPa; scene"),
     ("demo --scene luck", "invalid choice: 'luck'"),
