@@ -15,7 +15,7 @@ from pathlib import Path
 SRC = Path(__file__).resolve().parents[1] / "src"
 
 ROOMS = {
-    "hearts": ("emulator.hearts",),
+    "hearts": ("emulator.hearts", "calibrate.cli.commands.meshing"),
     "networks": (
         "emulator.surrogates.network.body",
         "emulator.surrogates.network.family",
@@ -60,6 +60,7 @@ ROOMS = {
 """The modules and packages of each room."""
 
 NEIGHBOURS = {
+    "hearts": {"pages"},
     "analyses": {"released", "pages", "specimens"},
     "fields": {"hearts", "specimens"},
     "pages": {"analyses", "populations", "serving", "specimens"},

@@ -43,7 +43,7 @@ COMMANDS = {
     "identify": "analyses",
     "infer": "posteriors",
     "init": "scene_files",
-    "mesh": "scene_files",
+    "mesh": "meshing",
     "predict": "prediction",
     "released": "train",
     "report": "posteriors",

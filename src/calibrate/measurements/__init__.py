@@ -45,7 +45,7 @@ from calibrate.measurements.surface import (
     surface_points,
 )
 from calibrate.measurements.volume import CavityVolume
-from calibrate.measurements.words import from_json, parse, usage_of
+from calibrate.measurements.words import from_json, kinds_of, parse, usage_of
 from calibrate.state_names import in_state, split
 from emulator.core.errors import InputError, look_up
 from emulator.core.rooms import offered
@@ -102,15 +102,6 @@ __all__ = [
     "surface_distances",
     "surface_points",
 ]
-
-
-def kinds_of(scene: ForwardProblem) -> Mapping[str, type[Observation]]:
-    """Return the kinds of observation of a problem by name: of another program, its outputs."""
-    if not scene.outside:
-        return OBSERVATIONS
-    (kinds_of_outputs,) = offered("calibrate.external.outputs", "kinds_of_outputs")
-    kinds: Mapping[str, type[Observation]] = kinds_of_outputs(scene)
-    return kinds
 
 
 def parse_observation(

@@ -28,7 +28,6 @@ from pathlib import Path
 
 import numpy as np
 
-from calibrate.measurements import OBSERVATIONS, kinds_of
 from calibrate.measurements.collection import Observations, check_some, observations
 from calibrate.measurements.observation import (
     Block,
@@ -46,7 +45,7 @@ from calibrate.measurements.tables import (
     write_csv,
     write_netcdf,
 )
-from calibrate.measurements.words import names_of, parse
+from calibrate.measurements.words import kinds_of, names_of, parse
 from calibrate.state_names import in_state, split
 from emulator.core.cells import OTHER_SPREADSHEETS, SPREADSHEETS, TEXT, Cells
 from emulator.core.errors import InputError
@@ -100,8 +99,7 @@ def _observed(
     scene: ForwardProblem, file: DataTable, state: str
 ) -> dict[str, tuple[Observation, np.ndarray]]:
     """Return the observations of one load state and their data, by name."""
-    kinds = kinds_of(scene) if scene.outside else OBSERVATIONS
-    layouts, observed = _layouts(file, kinds), {}
+    layouts, observed = _layouts(file, kinds_of(scene)), {}
     for base, (kind, layout) in layouts.items():
         name, places = in_state(base, state), _words(layout, where=True)
         sharing = [other for _, other in layouts.values() if places & _words(other, where=True)]

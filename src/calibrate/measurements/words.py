@@ -10,7 +10,19 @@ import numpy as np
 from calibrate.measurements.observation import Observation
 from calibrate.measurements.points import PointObservation
 from emulator.core.errors import InputError
+from emulator.core.rooms import offered
 from emulator.scenes.forward_problem import ForwardProblem
+
+
+def kinds_of(scene: ForwardProblem) -> Mapping[str, type[Observation]]:
+    """Return the kinds of observation of a problem by name: of another program, its outputs."""
+    from calibrate.measurements import OBSERVATIONS  # which imports this file
+
+    if not scene.outside:
+        return OBSERVATIONS
+    (kinds_of_outputs,) = offered("calibrate.external.outputs", "kinds_of_outputs")
+    kinds: Mapping[str, type[Observation]] = kinds_of_outputs(scene)
+    return kinds
 
 
 def names_of(part: Observation) -> tuple[str, ...]:

@@ -36,7 +36,7 @@ MEAN, MEDIAN, README, PARAMETERS = "mean", "median", "README.md", "parameters.cs
 
 @dataclass(frozen=True)
 class Export:
-    """What was exported.
+    """A record of the files that were exported.
 
     program, law : the program's name and the law's.
     folder : the folder that was written.

@@ -249,8 +249,7 @@ def process_of(
     constant = np.ptp(outputs, axis=0) == 0.0
     sd = np.where(constant, 1.0, sd)
     x, whole = (positions - centre) / width, (outputs - mean) / sd
-    modes = _modes(whole)
-    y = whole @ np.linalg.pinv(modes) if len(modes) < len(mean) else whole
+    y, modes = scores_and_modes(whole)
     missed = whole - y @ modes
     held_out = np.arange(len(x)) % _HELD_OUT == _HELD_OUT - 1
     ratio = _excess(x, y, held_out, progress)
@@ -264,19 +263,20 @@ def process_of(
     return Process(x, centre, width, mean, sd, modes, rest, logs, weights, variance, left_out)
 
 
-def _modes(outputs: np.ndarray) -> np.ndarray:
-    r"""Return the modes (m, n) of standardised outputs (c, n): each output is one, if they are few.
+def scores_and_modes(outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    r"""Return scores (c, m) and modes (m, n) of standardised outputs (c, n).
 
-    Of a field they are its principal components :math:`v_k`, divided by the number of rows' root so
-    that scores have the size of an output's, down to a share of 1e-6 of the variance:
-    :math:`y = \sum_k s_k\, \sigma_k v_k / \sqrt c`, singular values :math:`\sigma_k`.
+    Each output is a mode if they are few. A field :math:`Y = U \Sigma V^T` has its principal
+    components, down to a share of 1e-6 of the variance, with scores of unit mean square:
+
+    .. math:: Y \approx S M, \quad S = \sqrt c\, U, \quad M = \Sigma V^T / \sqrt c .
     """
     if outputs.shape[1] <= _MOST_OUTPUTS:
-        return np.eye(outputs.shape[1])
-    _, sizes, vectors = np.linalg.svd(outputs, full_matrices=False)
-    left = 1.0 - np.cumsum(sizes**2) / np.sum(sizes**2)
+        return outputs, np.eye(outputs.shape[1])
+    vectors, sizes, modes = np.linalg.svd(outputs, full_matrices=False)
+    left, root = 1.0 - np.cumsum(sizes**2) / np.sum(sizes**2), np.sqrt(len(outputs))
     count = min(int(np.searchsorted(-left, -_LEFT)) + 1, _MOST_MODES)
-    return sizes[:count, None] * vectors[:count] / np.sqrt(len(outputs))
+    return root * vectors[:, :count], sizes[:count, None] * modes[:count] / root
 
 
 def _every(x: np.ndarray, y: np.ndarray, most: int, progress: Callable[[], Any]) -> np.ndarray:

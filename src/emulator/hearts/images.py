@@ -18,13 +18,14 @@ import numpy as np
 from emulator.core.errors import InputError
 from emulator.core.units import IN_MM, MM3_PER_ML
 
+NEEDED = "images need nibabel, pynrrd and scikit-image: pip install 'soft-tissue-calibrate[images]'"
+"""The line that says which extra is lacking."""
+
 try:
     import nibabel
     import nrrd
 except ModuleNotFoundError as error:
-    raise InputError(
-        "images need nibabel, pynrrd and scikit-image: pip install 'soft-tissue-calibrate[images]'"
-    ) from error
+    raise InputError(NEEDED) from error
 
 _NIFTI, _NRRD = (".nii", ".nii.gz"), (".nrrd",)
 _UNITS = {"mm": "mm", "meter": "m", "micron": "um", "unknown": "mm"}  # NIfTI's words
@@ -116,7 +117,7 @@ def label_image(
     Raises
     ------
     InputError
-        As of :func:`read_labels`.
+        What :func:`read_labels` refuses.
     """
     name = f"image {name}"
     if values.ndim > 3:

@@ -27,15 +27,13 @@ from scipy.optimize import brentq
 from emulator.core.errors import InputError
 from emulator.core.units import MM3_PER_ML
 from emulator.geometry.mesh import parts
-from emulator.hearts.images import LabelImage
+from emulator.hearts.images import NEEDED, LabelImage
 from emulator.hearts.surfaces import Surface, place_of, surface
 
 try:
     from skimage.measure import marching_cubes
 except ModuleNotFoundError as error:
-    raise InputError(
-        "images need nibabel, pynrrd and scikit-image: pip install 'soft-tissue-calibrate[images]'"
-    ) from error
+    raise InputError(NEEDED) from error
 
 _BLUR = 0.7  # of the cube root of a voxel's volume: takes steps off and keeps walls of two voxels
 _TRUNCATE = 4.0  # standard deviations, where the Gaussian ends
@@ -161,7 +159,7 @@ def left_ventricle(
     Raises
     ------
     InputError
-        As of :func:`label_surface`, one label for both, or blood that myocardium encloses.
+        What :func:`label_surface` refuses, one label for both, or blood that myocardium encloses.
     """
     if set(blood) & set(myocardium):
         raise InputError(f"--blood {min(blood)} is a label of --myocardium, too; expected another")

@@ -16,6 +16,8 @@ from emulator.core.errors import InputError, look_up
 from emulator.mechanics.laws import LAWS, Law
 from emulator.scenes.parameter_space import LogNormal
 
+LOG_SD, LOG_SD_OF_NUMBERS = 1.0, 0.7
+"""Log-sds of priors for which no spread is published: of moduli, and of exponents."""
 _HUMAN = (
     "human left ventricles in vivo, middle of the range of Dalton, Husmeier & Gao (2023), "
     "Section 3.4; no published spread: log-sd 1, of exponents 0.7"
@@ -32,7 +34,7 @@ _FILLED = (
 
 def _alike(source: str, **medians: float) -> dict[str, LogNormal]:
     return {
-        name: LogNormal(median, 0.7 if name.startswith("b") else 1.0, source)
+        name: LogNormal(median, LOG_SD_OF_NUMBERS if name.startswith("b") else LOG_SD, source)
         for name, median in medians.items()
     }
 

@@ -11,7 +11,8 @@ import calibrate as cal
 import emulator as em
 from calibrate.cli import main
 from calibrate.external.by_rows import examine_rows
-from calibrate.measurements import kinds_of, observations_from_json, parse_observation
+from calibrate.measurements import observations_from_json, parse_observation
+from calibrate.measurements.words import kinds_of
 from calibrate.project import read_posterior
 from cli_support import answer, complaint
 from emulator.catalogue import find_problem

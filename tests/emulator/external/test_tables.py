@@ -10,7 +10,7 @@ import xarray as xr
 from calibrate.external.draft import draft_of_table
 from emulator.catalogue import find_problem
 from emulator.core.errors import InputError
-from emulator.external.rows import rows_map, samples_of
+from emulator.external.rows import rows_map, samples_of, scores_and_modes
 from emulator.external.tables import content_of, read_runs
 
 PLACES = np.linspace(0.0, 1.0, 20)
@@ -84,6 +84,20 @@ def test_a_drafted_problem_has_sizes_and_units_and_predicts_the_field(tmp_path):
     drawn, sds = forward.drawn_errors(fresh, np.arange(41), 400, np.random.default_rng(0))
     assert np.allclose(drawn.std(axis=0), sds, rtol=0.3)
     assert 0.8 < np.mean(np.abs(predicted - truth) < 1.645 * sds) <= 1.0
+
+
+def test_modes_are_those_of_the_covariance_and_leave_out_a_millionth():
+    """Rows of M are eigenvectors of Y^T Y / c, and their squared lengths its eigenvalues."""
+    field_of_runs = field(runs(60)[0]).reshape(60, 40)
+    y = field_of_runs - field_of_runs.mean(axis=0)
+    scores, modes = scores_and_modes(y)
+    values = np.linalg.eigvalsh(y.T @ y / 60)[::-1]
+    sizes = np.sum(modes**2, axis=1)
+    assert np.allclose(sizes, values[: len(modes)])
+    assert np.allclose((y.T @ y / 60) @ modes.T, modes.T * sizes)
+    assert np.allclose(np.mean(scores**2, axis=0), 1.0)
+    left = np.sum((y - scores @ modes) ** 2) / np.sum(y**2)
+    assert left < 1e-6 < values[len(modes) - 1 :].sum() / values.sum()
 
 
 def test_drawn_errors_of_a_field_go_together(tmp_path):

@@ -76,7 +76,7 @@ def _run_outside(problem: ForwardProblem, theta: jax.Array) -> Answer:
     """Run another program at one theta, and return its outputs."""
     import numpy as np
 
-    from calibrate.measurements import kinds_of
+    from calibrate.measurements.words import kinds_of
     from calibrate.project.problem import simulator_of
 
     u = simulator_of(problem)(theta)

@@ -33,6 +33,8 @@ Values = Mapping[str, float]
 """Parameters of a law by name, in the law's units."""
 SPLIT = dict.fromkeys(("neo_hookean", "neo_hookean_E_nu"), "its neo-Hookean energy is isochoric")
 """The refusals of compressible laws by programs that split every energy."""
+ISOCHORIC_GUCCIONE = "its Guccione energy is of the isochoric strain, so that forces would differ"
+"""The refusal of Guccione's law by the same programs."""
 
 
 @dataclass(frozen=True)

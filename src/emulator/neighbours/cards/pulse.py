@@ -26,7 +26,14 @@ from typing import Any
 import meshio
 import numpy as np
 
-from emulator.neighbours.cards.card import SPLIT, ExportedBody, Form, Program, Values
+from emulator.neighbours.cards.card import (
+    ISOCHORIC_GUCCIONE,
+    SPLIT,
+    ExportedBody,
+    Form,
+    Program,
+    Values,
+)
 
 _SWITCH_OFF = ["use_subplus=False", "use_heaviside=False"]
 
@@ -115,14 +122,13 @@ _FORMS: Mapping[str, Form] = {
     "holzapfel_ogden_released": Form(_exponential(*_FIBRES, factor=2.0, switch=False)),
     "holzapfel_ogden_orthotropic": Form(_exponential(*_FIBRES, "a_s", "b_s", "a_fs", "b_fs")),
 }
-_GUCCIONE = "its Guccione energy is of the isochoric strain, so that forces would differ"
 PULSE = Program(
     name="pulse",
     title="pulse 0.12",
     suffix=".py",
     units="mm, kPa (pulse converts; give its problem mesh_unit mm)",
     forms=_FORMS,
-    refusals={"guccione": _GUCCIONE, **SPLIT},
+    refusals={"guccione": ISOCHORIC_GUCCIONE, **SPLIT},
     write_body=write_body,
     usage="A card is a module: `from mean import material, compressibility`. `case.py` builds "
     "mesh, directions and model of any card; give `StaticProblem` the `mesh_unit` `mm`.",

@@ -30,7 +30,15 @@ from pathlib import Path
 import meshio
 import numpy as np
 
-from emulator.neighbours.cards.card import SPLIT, ExportedBody, Form, Program, Values, digits
+from emulator.neighbours.cards.card import (
+    ISOCHORIC_GUCCIONE,
+    SPLIT,
+    ExportedBody,
+    Form,
+    Program,
+    Values,
+    digits,
+)
 
 SHARP = 1e3
 """The k of the switch: larger ones overflow at stretches of 1.3."""
@@ -111,7 +119,6 @@ _SMOOTH = (
     "differs by less than a_f/k, where the squared stretch differs from 1 by less than about 1/k.",
 )
 _OFF = ("k = 0 halves the fibres' energy at every stretch, so their moduli are doubled.",)
-_GUCCIONE = "its Guccione energy is of the isochoric strain, so that forces would differ"
 SVMULTIPHYSICS = Program(
     name="svmultiphysics",
     title="svMultiPhysics",
@@ -131,7 +138,7 @@ SVMULTIPHYSICS = Program(
             ("holzapfel_gasser_ogden", "gasser_ogden_holzapfel"),
             "its arterial fibres resist compression, too, so that forces would differ",
         ),
-        "guccione": _GUCCIONE,
+        "guccione": ISOCHORIC_GUCCIONE,
         **SPLIT,
     },
     write_body=write_body,

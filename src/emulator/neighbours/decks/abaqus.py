@@ -75,8 +75,8 @@ class _AbaqusReading:
                 self.tables[block.keyword, name] = block
             elif block.keyword in _CONDITIONS:
                 self.conditions.append(block)
-            elif block.keyword == "STATIC" and len([*block.rows, []][0]) > 1 and block.rows[0][1]:
-                self.period = file.numbers(block.rows[0][1:2], block.line, 1)[0]
+            elif block.keyword == "STATIC" and (times := block.first[1:2]) not in ([], [""]):
+                self.period = file.numbers(times, block.line, 1)[0]
             elif not self.body.read(block) and block.keyword not in _SETTINGS:
                 file.skip(block.line, block.described())
 
@@ -106,9 +106,10 @@ class _AbaqusReading:
     def _material(self, name: str, blocks: list[Block]) -> Material:
         density, laws = None, []
         for block in blocks:
-            values = self.file.numbers(block.words(), [*block.lines, block.line][0])
+            line = block.lines[0] if block.lines else block.line
+            values = self.file.numbers(block.words(), line)
             if block.keyword == "DENSITY":
-                density = [*values, None][0]
+                density = values[0] if values else None
             elif block.keyword == "ELASTIC":
                 isotropic = block.options.get("TYPE", "ISO")[:3].upper() == "ISO"
                 if self.finite or not isotropic or len(block.rows) != 1 or len(values) < 2:

@@ -30,10 +30,10 @@ from emulator.scenes.draft import guessed_unit, quoted
 from emulator.scenes.file import read_scene
 from emulator.scenes.part import Part
 from emulator.scenes.scene import Scene, with_mesh
+from emulator.scenes.tissue_priors import LOG_SD, LOG_SD_OF_NUMBERS
 
 _HEAD = 100_000  # bytes of a file by which its program is recognised
 _CONSTANTS = ("kappa",)
-_LOG_SD, _LOG_SD_OF_NUMBERS = 1.0, 0.7
 _HALF = 0.5  # of a value, to each side, where a log-normal has no place
 _TO_LIMIT = 0.9  # of the way to a limit, at most
 # Powers of stress and of length in the units of the fields of loads and supports.
@@ -182,7 +182,7 @@ def _parameter(quantity: Quantity, value: float, source: str) -> str:
     lines = [f"[parameters.{quantity.name}]"]
     lines += [f'unit = "{quantity.unit}"'] if quantity.unit else []
     if (quantity.low, quantity.high) == (0.0, math.inf):
-        log_sd = _LOG_SD if quantity.unit else _LOG_SD_OF_NUMBERS
+        log_sd = LOG_SD if quantity.unit else LOG_SD_OF_NUMBERS
         words = f"{source}; no spread is known: log-sd {log_sd:g}"
         return "\n".join([*lines, f"median = {value!r}", f"log_sd = {log_sd:g}",
                           f"source = {quoted(words)}"])  # fmt: skip

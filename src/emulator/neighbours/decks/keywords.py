@@ -30,6 +30,11 @@ class Block:
         options = (f"{k}={v}" if v else k for k, v in self.options.items())
         return ", ".join([f"*{self.keyword}", *options])
 
+    @property
+    def first(self) -> list[str]:
+        """The words of the first row; none without rows."""
+        return self.rows[0] if self.rows else []
+
     def words(self) -> list[str]:
         """Return the words of all rows."""
         return [word for row in self.rows for word in row if word]
