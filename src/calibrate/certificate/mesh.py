@@ -277,7 +277,8 @@ def _corrections_by(predictive: Predictive, runs: FEMRuns) -> CorrectionBy:
     ) -> tuple[Correction, Correction]:
         if not len(z):
             return on_mesh, on_mesh
-        of_mesh = fit_correction(predictive.features(z), D, predictive.scales, len(z), like=like)
+        x_fine, scales = predictive.features(z), predictive.scales
+        of_mesh = fit_correction(x_fine, D, scales, len(z), like=like, exact=True)
         errors = errors_on_mesh + np.asarray(corrections(of_mesh, x))
         return fitted(errors, like=on_mesh), of_mesh
 

@@ -146,6 +146,8 @@ def fit_correction(
     likely: np.ndarray | None = None,
     like: Correction | None = None,
     slopes: np.ndarray | None = None,
+    *,
+    exact: bool = False,
 ) -> Correction:
     """Return the best of a Gaussian process of all points, one of likely points, and none.
 
@@ -159,6 +161,9 @@ def fit_correction(
     likely : (n,) bool, points that FEM finds likely, which decide what is best; all by default.
     like : the correction whose points and kernel are taken; by default they are searched for.
     slopes : the derivatives (n, q, m) of the errors in the features, NaN for a run without them.
+    exact : whether the errors are smooth, without a bump anywhere, so that a process passes through
+        all of them. "None" is then no candidate: of as many points as unknowns, each left out is
+        so badly continued by the others that none would seem better, whatever the errors are.
     """
     every = np.ones(len(x), dtype=bool)
     likely = every if likely is None or not likely.any() else likely
@@ -177,8 +182,9 @@ def fit_correction(
     )
     smallest = np.log(squared_errors[likely] + _NEGLIGIBLE**2).mean()
     for used in parts:
-        fitted, loss = _fitted(x[used], observed[used], scales, rows, likely[used], like)
-        if loss < smallest:
+        nuggets = _FIRST_NUGGETS if exact else _NUGGETS
+        fitted, loss = _fitted(x[used], observed[used], scales, rows, likely[used], like, nuggets)
+        if exact or loss < smallest:
             best, smallest = fitted._replace(local=used is not every), loss
     return best
 
@@ -206,11 +212,12 @@ def _fitted(
     rows: int,
     likely: np.ndarray,
     like: Correction | None,
+    nuggets: tuple[float, ...],
 ) -> tuple[Correction, float]:
     """Return the process of these points, and the mean log of its errors where it is ``likely``.
 
     observed : the errors and their derivatives (n, 1 + q, m), NaN where there are none.
-    like : the correction whose kernel is taken; None to search for one.
+    like : the correction whose kernel is taken; None to search for one, with one of ``nuggets``.
     """
     count, per_run, data = observed.shape
     width = x.std(axis=0)
@@ -241,7 +248,7 @@ def _fitted(
     if like is None:
         processes = [process(*kernel) for kernel in product(_LENGTHS, _FIRST_NUGGETS)]
         length = min(processes, key=lambda p: p.loss).length
-        processes += [process(length, n) for n in _NUGGETS if n not in _FIRST_NUGGETS]
+        processes += [process(length, n) for n in nuggets if n not in _FIRST_NUGGETS]
     else:
         processes = [process(like.length, like.nugget)]
     best = min(processes, key=lambda p: p.loss)

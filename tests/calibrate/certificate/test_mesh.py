@@ -16,7 +16,7 @@ from calibrate.certificate.verdict import judge
 from calibrate.statistical_model.finer_fem import finer_fem
 from certificate_support import exact_data, exact_posterior, grid_of, linear_model, quadrature
 from emulator.core.engine import Engine
-from emulator.surrogates.correction import fit_correction
+from emulator.surrogates.correction import corrections, fit_correction
 from emulator.surrogates.taylor import expand
 from linear_support import LinearSimulator, linear_forward
 
@@ -94,6 +94,18 @@ def test_a_fit_like_another_has_its_kernel():
     like = fit_correction(x, x**2, np.ones(1), 12, like=wavy)
     assert (alone.length, alone.nugget) != (wavy.length, wavy.nugget)
     assert (like.length, like.nugget) == (wavy.length, wavy.nugget)
+
+
+@pytest.mark.parametrize("unknowns", [2, 4, 6, 12])
+def test_four_points_continue_a_difference_that_hardly_varies(unknowns):
+    """Of as many points as unknowns, those left out would be met better by no difference at all."""
+    rng, fitted = np.random.default_rng(unknowns), []
+    for _ in range(20):
+        x = rng.normal(size=(4, unknowns))
+        D = np.array([1.6, 2.2]) + 0.1 * x @ rng.normal(size=(unknowns, 2)) / unknowns**0.5
+        correction = fit_correction(x, D, np.full(2, 3.0), 4, exact=True)
+        fitted.append(np.asarray(corrections(correction, x.mean(axis=0)[None]))[0] - D.mean(axis=0))
+    assert np.abs(fitted).max() < 0.1
 
 
 def test_points_are_far_from_each_other(fem, check):
