@@ -55,6 +55,12 @@ def test_the_site_builds_without_a_warning(tmp_path):
     for path in (ROOT / "docs").glob("*.md"):  # as llms.txt links them
         assert (tmp_path / path.name).read_bytes() == path.read_bytes()
     assert (tmp_path / "llms.txt").is_file()
+    notation = (tmp_path / "notation.html").read_text(encoding="utf-8")
+    assert notation.count("<math ") > 40
+    assert "mathjax" not in notation.lower()
+    front = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert len(re.findall(r'<div class="card docutils', front)) == 12
+    assert "Copyright &#169; 2026" in front
 
 
 def test_no_line_of_prose_is_wider_than_100_characters():
@@ -124,7 +130,7 @@ def shell_lines(page):
     return [words for words in commands if words]
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/quickstart.md", *FRONT])
+@pytest.mark.parametrize("page", ["README.md", "docs/quickstart.md", "docs/tutorial.md", *FRONT])
 def test_command_lines_are_words_that_the_commands_know(page):
     """Commands of this package are parsed; targets, modules and files of the others exist."""
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
