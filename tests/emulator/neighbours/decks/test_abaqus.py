@@ -274,8 +274,8 @@ def test_fungs_constants_in_the_axes_of_an_orientation(tmp_path):
     values = [float(read[f"b_{k}"]) for k in range(1, 10)]
     np.testing.assert_allclose(values, expected, rtol=1e-12)
     assert [float(read[name]) for name in ("C", "mu", "kappa")] == pytest.approx([2.0, 0.0, 1e4])
-    np.testing.assert_allclose(draft.scene.fibres[:, 0], np.tile([0.0, 1.0, 0.0], (12, 1)))
-    np.testing.assert_allclose(draft.scene.sheets[:, 0], np.tile([-1.0, 0.0, 0.0], (12, 1)))
+    np.testing.assert_allclose(draft.scene.fibres, np.tile([0.0, 1.0, 0.0], (12, 1)))
+    np.testing.assert_allclose(draft.scene.sheets, np.tile([-1.0, 0.0, 0.0], (12, 1)))
     assert any("isochoric strain" in note for note in draft.notes)
 
 

@@ -6,6 +6,7 @@ Both are solved from the deck and from the scene of the Python interface, on coa
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 import emulator as em
 from deck_support import abaqus, abaqus_supports, drafted, febio, febio_supports, forces
@@ -117,6 +118,7 @@ def read(tmp_path, text, suffix, unit):
     return draft.scene, [note for note in draft.notes if "in the deck" in note]
 
 
+@pytest.mark.slow
 def test_land_2_of_both_programs_is_the_scene_of_python(tmp_path):
     """Guccione's law with C = 10 kPa and exponents of 1, at 10 kPa (Land et al. 2015)."""
     exponents = {f"b_{k}": (1.0, 0.0, 0.5)[(k - 1) // 3] for k in range(1, 10)}
@@ -139,6 +141,7 @@ def test_land_2_of_both_programs_is_the_scene_of_python(tmp_path):
     np.testing.assert_allclose(VENTRICLE.nodes[apex, 2] + u[apex, 2], APEXES, rtol=0.005)
 
 
+@pytest.mark.slow
 def test_the_strip_of_gasser_of_both_programs_is_the_scene_of_python(tmp_path):
     """The adventitia along the circumference, pulled between clamps by a tenth."""
     expected = by_python(
