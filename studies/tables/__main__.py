@@ -3,13 +3,15 @@
     python -m studies.tables --data DIR      # DIR/cardiacN/processed/{parameters,outputs}.csv
     python -m studies.tables --quick         # a table made here
 
-The rows are shuffled once; every fifth is kept apart. Its outputs are predicted, with their 90 %;
-then ten of these rows are data, with noise of 2 % of each output's sd, and their inputs are
-inferred.
+The rows are shuffled once; every fifth is kept apart. Its outputs are predicted, with their 90 %,
+and by AutoEmulate from the same rows where ``--peers PYTHON`` (or CALIBRATE_AUTOEMULATE) names an
+interpreter that has it; then ten of these rows are data, with noise of 2 % of each output's sd, and
+their inputs are inferred.
 Writes results.json after each table, and tables.png.
 """
 
 import csv
+import os
 import tempfile
 from pathlib import Path
 from time import perf_counter
@@ -18,6 +20,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from studies.common.fenicsx import solve
 from studies.common.figures import BLUE, GREEN, pyplot
 from studies.common.output import Case, Results, parser, save
 
@@ -28,8 +31,10 @@ SEED = 0
 HELD_OUT = 5  # one row of so many
 NOISE = 0.02  # sd of the data, in sds of each output over the rows
 POSTERIORS = 10
-MOST_INPUTS = 9  # of tables whose inputs are inferred
+MOST_INPUTS = 9  # with more of them, posteriors are Laplace's approximation
 OPTIONS = cal.samplers.NUTSOptions(warmup=300, draws=400, chains=2)
+PEER = Path(__file__).with_name("autoemulate_best.py")
+PEER_SECONDS = 300.0  # that it may choose for, a table
 
 
 def read(folder: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -50,7 +55,6 @@ def made(rows: int = 90) -> tuple[np.ndarray, np.ndarray]:
 
 def write(folder: Path, x: np.ndarray, y: np.ndarray, data: np.ndarray) -> Path:
     """The files of a problem: its table, a file of data, and an experiment."""
-    # Of many inputs only the map is looked at, not the posterior.
     sampler = "nuts" if x.shape[1] <= MOST_INPUTS else "laplace"
     inputs, outputs = [f"x{k}" for k in range(x.shape[1])], [f"y{k}" for k in range(y.shape[1])]
     for name, head, rows in (
@@ -75,7 +79,25 @@ def write(folder: Path, x: np.ndarray, y: np.ndarray, data: np.ndarray) -> Path:
     return folder / "experiment.toml"
 
 
-def case(x: np.ndarray, y: np.ndarray, posteriors: int) -> Case:
+def r2_of(predicted: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The R2 (n,) of predictions of rows (c, n)."""
+    return 1.0 - ((predicted - y) ** 2).sum(axis=0) / ((y - y.mean(axis=0)) ** 2).sum(axis=0)
+
+
+def beside(python: str, x: np.ndarray, y: np.ndarray, apart: np.ndarray, truth: np.ndarray) -> Case:
+    """AutoEmulate's best model of the same rows, by its own choice."""
+    problem = {"x": x, "y": y, "apart": apart, "seconds": PEER_SECONDS}
+    answer = solve(python, problem, PEER)
+    return {
+        "best": str(answer["best"]),
+        "r2": float(r2_of(answer["predicted"], truth).mean()),
+        "models_compared": len(answer["models"]),
+        "seconds": float(answer["seconds"]),
+        "version": str(answer["version"]),
+    }
+
+
+def case(x: np.ndarray, y: np.ndarray, python: str | None) -> Case:
     """Errors of outputs of rows kept apart, and coverage of the inputs of some of them."""
     order = np.random.default_rng(SEED).permutation(len(x))
     apart, known = order[: len(x) // HELD_OUT], order[len(x) // HELD_OUT :]
@@ -93,20 +115,24 @@ def case(x: np.ndarray, y: np.ndarray, posteriors: int) -> Case:
         _, sds = full.drawn_errors(x[apart], np.arange(y.shape[1]), 1, rng)
         found = [posterior.draws()]
         names = posterior.model.observe.parts
-        for row in data[1:posteriors]:
+        few = {"sampler": "nuts", "options": OPTIONS}
+        by = few if x.shape[1] <= MOST_INPUTS else {"sampler": "laplace"}
+        for row in data[1:POSTERIORS]:
             values = dict(zip(names, row, strict=True))
-            found.append(
-                cal.sample(posterior.model, values, sampler="nuts", options=OPTIONS).draws()
-            )
-    errors = predicted - y[apart]
-    r2 = 1.0 - (errors**2).sum(axis=0) / ((y[apart] - y[apart].mean(axis=0)) ** 2).sum(axis=0)
-    covered = [
-        np.mean(draws[f"x{k}"] < x[row, k])
-        for row, draws in zip(apart[:posteriors], found, strict=True)
-        for k in range(x.shape[1])
-    ]
-    ranks = np.array(covered)
+            found.append(cal.sample(posterior.model, values, **by).draws())
+    errors, r2 = predicted - y[apart], r2_of(predicted, y[apart])
+    ranks = np.array(
+        [
+            np.mean(draws[f"x{k}"] < x[row, k])
+            for row, draws in zip(apart[:POSTERIORS], found, strict=True)
+            for k in range(x.shape[1])
+        ]
+    )
+    peer = {}
+    if python is not None:
+        peer = {"AutoEmulate": beside(python, x[known], y[known], x[apart], y[apart])}
     return {
+        **peer,
         "rows": len(x),
         "inputs": x.shape[1],
         "outputs": y.shape[1],
@@ -123,7 +149,12 @@ def draw(cases: list[Case], path: Path) -> None:
     """R2 and coverage of each table."""
     figure, axes = pyplot().subplots(1, 2, figsize=(9, 3), layout="constrained")
     names = [c["name"] for c in cases]
-    axes[0].barh(names, [1.0 - c["r2"] for c in cases], color=BLUE)
+    axes[0].barh(names, [1.0 - c["r2"] for c in cases], color=BLUE, label="this package")
+    theirs = [(c["name"], 1.0 - c["AutoEmulate"]["r2"]) for c in cases if "AutoEmulate" in c]
+    if theirs:
+        axes[0].plot([v for _, v in theirs], [n for n, _ in theirs], "o", color="grey", mec="black")
+        axes[0].plot([], [], "o", color="grey", mec="black", label="AutoEmulate's best")
+        axes[0].legend(fontsize="small")
     axes[0].set(xlabel="1 - R2 of outputs kept apart, mean", xscale="log")
     axes[1].barh(names, [c["inside_90"] for c in cases], color=GREEN)
     axes[1].axvspan(0.85, 0.95, color="grey", alpha=0.25)
@@ -138,16 +169,17 @@ def main() -> None:
     """Make the cases, results.json and the picture."""
     words = parser(__doc__, HERE)
     words.add_argument("--data", type=Path, help="folder of tables")
+    peer = os.environ.get("CALIBRATE_AUTOEMULATE")
+    words.add_argument("--peers", default=peer, help="an interpreter that has AutoEmulate")
     arguments = words.parse_args()
     results = Results(arguments.out, SEED, again=arguments.again)
     found = [] if arguments.data is None else arguments.data.glob("cardiac*/processed/outputs.csv")
     tables = {path.parts[-3]: path.parent for path in sorted(found, reverse=True)}  # small first
     if not tables or arguments.quick:
-        results.case("made", lambda: case(*made(), 2))
+        results.case("made", lambda: case(*made(), arguments.peers))
     for name, folder in {} if arguments.quick else tables.items():
-        x, y = read(folder)
-        count = POSTERIORS if x.shape[1] <= MOST_INPUTS else 1
-        results.case(name, lambda x=x, y=y, count=count: case(x, y, count))
+        table = read(folder)
+        results.case(name, lambda table=table: case(*table, arguments.peers))
     results.write()
     draw(results.cases, arguments.out / "tables.png")
     for done in results.cases:

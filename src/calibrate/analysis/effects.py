@@ -111,12 +111,7 @@ def recommend(
         FEM fails on the scene as it is.
     """
     observation_points = observations(observe)
-    if observation_points.states != ("",):
-        raise InputError("effects: observations of several load states; take one at a time")
-    limits = observation_points.name(tolerance, "effects: tolerance")
-    for name, limit in limits.items():
-        if not 0.0 < limit < np.inf:
-            raise InputError(f"effects: the tolerance of {name} is {limit:g}; it must be above 0")
+    limits = _limits(observation_points, tolerance)
     if samples < 2:
         raise InputError(f"effects: {samples} samples; give 2 or more")
     check_seed(seed, "effects")
@@ -125,14 +120,7 @@ def recommend(
         raise InputError(f"scene '{scene.name}' has no effect that it can do without")
     compared = WithoutTerms(scene, observation_points, samples, seed, say)
     alone = [compared.without((name,)) for name in effects]
-    chosen: tuple[str, ...] = ()
-    best = compared.without(())
-    for effect in sorted(alone, key=lambda m: m.ratio):
-        if not effect.within(limits) or effect.ratio > _SAVES:
-            continue
-        trial = compared.without((*chosen, *effect.left_out))
-        if trial.within(limits) and trial.ratio < _SAVES * best.ratio:
-            chosen, best = (*chosen, *effect.left_out), trial
+    chosen = _that_save(compared, alone, limits)
     whole = judged = compared.without(())
     trials = 0
     while chosen:
@@ -153,6 +141,35 @@ def recommend(
         leave_out(scene, chosen),
         effects,
     )
+
+
+def _limits(observed: Observations, tolerance: Mapping[str, float] | float) -> Mapping[str, float]:
+    """Return the tolerance of each observation by name; refuse several load states."""
+    if observed.states != ("",):
+        raise InputError("effects: observations of several load states; take one at a time")
+    limits = observed.name(tolerance, "effects: tolerance")
+    for name, limit in limits.items():
+        if not 0.0 < limit < np.inf:
+            raise InputError(f"effects: the tolerance of {name} is {limit:g}; it must be above 0")
+    return limits
+
+
+def _that_save(
+    compared: WithoutTerms, alone: Sequence[Measured], limits: Mapping[str, float]
+) -> tuple[str, ...]:
+    """Return the effects that go together within the limits, each of which saves time.
+
+    alone : what was measured without one effect each; the one that saves most is tried first.
+    """
+    chosen: tuple[str, ...] = ()
+    best = compared.without(())
+    for effect in sorted(alone, key=lambda m: m.ratio):
+        if not effect.within(limits) or effect.ratio > _SAVES:
+            continue
+        trial = compared.without((*chosen, *effect.left_out))
+        if trial.within(limits) and trial.ratio < _SAVES * best.ratio:
+            chosen, best = (*chosen, *effect.left_out), trial
+    return chosen
 
 
 def tolerances(words: Sequence[str], observe: Observations) -> dict[str, float]:

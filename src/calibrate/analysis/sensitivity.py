@@ -341,14 +341,7 @@ def sensitivity(
     several = None if observe is None else observations(observe)
     if several is not None and several.states != ("",):
         raise InputError("sensitivity: observations of several load states; take one at a time")
-    prior = box_prior(scene) if prior is None else prior
-    dependence = dependence_of(prior)
-    if dependence is not None and np.any(dependence.correlation != np.eye(len(dependence.names))):
-        raise InputError(
-            f"sensitivity: the prior correlates {', '.join(dependence.names)}; shares of the "
-            "variance are defined for independent parameters, e.g. --prior box"
-        )
-    prior, _ = fit_to(forward, prior)
+    prior = _independent(forward, box_prior(scene) if prior is None else prior)
     factors = Factors(scene.parameter_names, dict(groups or {}))
     datasets = {}
     outputs = Outputs(forward, several, field=field, what="sensitivity")
@@ -367,6 +360,17 @@ def sensitivity(
             datasets[name] = datasets[name].assign_coords(output=outputs.nodes)
     about = {"forward": forward.label, "scene": scene.name, "method": method, "seed": seed}
     return xr.DataTree.from_dict({"/": xr.Dataset(attrs=about), **datasets})
+
+
+def _independent(forward: ForwardMap, prior: Prior) -> Prior:
+    """Return the prior within the range of the map; refuse one that correlates parameters."""
+    dependence = dependence_of(prior)
+    if dependence is not None and np.any(dependence.correlation != np.eye(len(dependence.names))):
+        raise InputError(
+            f"sensitivity: the prior correlates {', '.join(dependence.names)}; shares of the "
+            "variance are defined for independent parameters, e.g. --prior box"
+        )
+    return fit_to(forward, prior)[0]
 
 
 def indices_to_json(indices: xr.DataTree) -> dict[str, Any]:

@@ -270,8 +270,8 @@ def _faults(evidence: Evidence) -> Iterator[Finding]:
     if not p.failed_mass <= LARGEST_FAILED:
         yield (
             f"FEM fails on {100 * p.failed_mass:.0f} % of the posterior",
-            "raise --load-steps (NewtonOptions.load_steps), or narrow the prior to states that "
-            "exist",
+            "raise --load-steps (NewtonOptions.load_steps; another program has its own), or narrow "
+            "the prior to states that exist",
         )
     if p.unstable:
         yield (

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import jax
 import numpy as np
@@ -14,8 +14,12 @@ from calibrate.figures import pyplot, save, with_unit
 from calibrate.measurements import DISPLACEMENT
 from calibrate.measurements.points import DisplacementPoints
 from calibrate.posterior import Posterior
+from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import with_mesh
 from emulator.surrogates.network.graph import mesh_edges
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 def drawing() -> Callable[..., None]:
@@ -50,7 +54,7 @@ def draw(
     fields = np.asarray(jax.jit(lambda t: jax.lax.map(forward, t))(thetas[rows]))
     points = cast(DisplacementPoints, posterior.model.observe.parts[DISPLACEMENT]).points
     measured = points + np.asarray(posterior.data[DISPLACEMENT])
-    mesh, draws = with_mesh(scene).mesh, posterior.draws()
+    mesh = with_mesh(scene).mesh
     figure, (side, joint) = pyplot().subplots(
         1, 2, figsize=(12.5, 4.8), width_ratios=(1.9, 1.0), layout="constrained"
     )
@@ -69,21 +73,31 @@ def draw(
     side.set(xlabel="x (mm)", ylabel="z (mm)", aspect="equal")
     side.legend(loc="lower left", frameon=False)
     figure.colorbar(shades, ax=side, label="posterior sd of the position (mm)", shrink=0.85)
-    first, second = scene.parameters[:2]
-    joint.scatter(
+    _draw_joint(joint, scene.parameters, posterior.draws(), theta)
+    figure.suptitle(
+        f"{scene.name}: posterior by {posterior.model.forward.kind}, "
+        f"checked by FEM: {certificate.verdict} ({certificate.evidence.physics.runs} runs)"
+    )
+    save(figure, path)
+
+
+def _draw_joint(
+    axis: Axes,
+    parameters: Sequence[Parameter],
+    draws: Mapping[str, np.ndarray],
+    theta: Mapping[str, float],
+) -> None:
+    """Draw the posterior of the first two parameters in their box, and their truth."""
+    first, second = parameters[:2]
+    axis.scatter(
         draws[first.name], draws[second.name], s=4, alpha=0.25, lw=0, label="posterior draws"
     )
-    joint.plot(theta[first.name], theta[second.name], "k+", ms=14, mew=2, label="truth")
-    joint.set(
+    axis.plot(theta[first.name], theta[second.name], "k+", ms=14, mew=2, label="truth")
+    axis.set(
         xlabel=with_unit(first.name, first.unit),
         ylabel=with_unit(second.name, second.unit),
         xlim=(first.low, first.high),
         ylim=(second.low, second.high),
         title="prior box and posterior",
     )
-    joint.legend(loc="upper right", frameon=False)
-    figure.suptitle(
-        f"{scene.name}: posterior by {posterior.model.forward.kind}, "
-        f"checked by FEM: {certificate.verdict} ({certificate.evidence.physics.runs} runs)"
-    )
-    save(figure, path)
+    axis.legend(loc="upper right", frameon=False)

@@ -7,8 +7,10 @@ batches, populations agree and the tail of the weights is light, and those of NU
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar
+
+import jax
 
 from calibrate.importance.weights import LARGEST_PARETO_SHAPE
 from calibrate.samplers.diagnostics import converged
@@ -20,6 +22,9 @@ from calibrate.statistical_model.density import Density
 from emulator.core.errors import SolverError
 
 MOST_UNKNOWNS = 8
+# Draws of a population from which agreement is judged: fewer would disagree, or be too few for the
+# limit of effective draws, where populations are right.
+_JUDGED = 1000
 # Attributes of a run of ``auto``: whose draws they are, and why not those of importance sampling.
 SAMPLED_BY, NOT_BY_IMPORTANCE = "sampled_by", "not_by_importance"
 
@@ -62,15 +67,19 @@ def _by_importance(
         return f"{density.dimension} unknowns; up to {MOST_UNKNOWNS} are few"
     if not density.batches:
         return "the forward map solves FEM"
+    importance = _for(IMPORTANCE, options)
+    judged = replace(importance, draws=max(importance.draws, _JUDGED))
     try:
-        draws = IMPORTANCE.sample(density, data, _for(IMPORTANCE, options), context)
+        draws = IMPORTANCE.sample(density, data, judged, context)
     except SolverError as error:
         return str(error)
     if not (shape := draws.attributes["weights_pareto_k"]) <= LARGEST_PARETO_SHAPE:
         return f"the weights' tail is heavy, Pareto k {shape:.2f}"
     if not converged(draws.z, options.r_hat, options.ess):
         return "independent populations disagree"
-    return draws
+    z, statistics, attributes = draws
+    z, statistics = jax.tree.map(lambda of_chain: of_chain[:, : options.draws], (z, statistics))
+    return Draws(z, statistics, attributes)
 
 
 def _for(sampler: Sampler, options: AutoOptions) -> Any:

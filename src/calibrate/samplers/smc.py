@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from operator import itemgetter
 from typing import Any, ClassVar, NamedTuple
 
@@ -163,14 +164,7 @@ class _SMCPrograms(NamedTuple):
 
 @kept
 def _compile(density: Density, options: SMCOptions) -> _SMCPrograms:
-    import blackjax  # only some samplers need this import
-    from blackjax.smc import base, resampling
-
     count = options.draws
-    hmc = blackjax.hmc.build_kernel()
-
-    def log_likelihood(z: jax.Array, data: Data) -> jax.Array:
-        return jnp.maximum(density.log_likelihood(z, data), _LOWEST)
 
     def start(rng_key: jax.Array) -> _Particles:
         prior_key, next_key = jax.random.split(rng_key)
@@ -181,52 +175,63 @@ def _compile(density: Density, options: SMCOptions) -> _SMCPrograms:
         key_data = jax.random.key_data(next_key)
         return _Particles(key_data, particles, zero, zero, step_size, jnp.ones(count), 0)
 
-    def step(current: _Particles, data: Data) -> _Particles:
-        step_key, next_key = jax.random.split(jax.random.wrap_key_data(current.key_data))
-        particles, temperature = current.particles, current.temperature
-        heights = jax.vmap(log_likelihood, (0, None))(particles, data)
-        increment = _increment(heights, 1.0 - temperature, options.survivors)
-        # Sums of increments may miss 1 by round-off.
-        last = increment >= 1.0 - temperature
-        temperature = jnp.where(last, 1.0, temperature + increment)
-        log_weights = increment * heights
-        weights = jax.nn.softmax(log_weights)
-        covariance = jnp.atleast_2d(jnp.cov(particles, rowvar=False, aweights=weights))
-
-        def tempered(z: jax.Array) -> jax.Array:
-            return density.log_prior(z) + temperature * log_likelihood(z, data)
-
-        def transition(rng_key: jax.Array, state: Any, log_density: Any) -> Any:
-            # Trajectories of one length could return to their start, again and again.
-            length_key, hmc_key = jax.random.split(rng_key)
-            size = current.step_size * jax.random.uniform(length_key, minval=0.5)
-            return hmc(hmc_key, state, log_density, size, covariance, options.leapfrogs)
-
-        move, _ = base.update_and_take_last(
-            blackjax.hmc.init, tempered, transition, options.transitions, count
-        )
-        resampled, info = base.step(
-            step_key,
-            base.SMCState(particles, weights, {}),
-            move,
-            lambda particles: jnp.zeros(len(particles)),
-            resampling.systematic,
-        )
-        rates = info.update_info.acceptance_rate.mean(axis=1)
-        return _Particles(
-            jax.random.key_data(next_key),
-            resampled.particles,
-            temperature,
-            current.log_evidence + logsumexp(log_weights) - jnp.log(count),
-            current.step_size * jnp.exp(rates.mean() - options.target_accept),
-            rates,
-            current.steps + 1,
-        )
-
     def finish(particles: jax.Array, data: Data) -> jax.Array:
         return jax.vmap(jax.vmap(density.log_density, (0, None)), (0, None))(particles, data)
 
-    return _SMCPrograms(jax.jit(start), jax.jit(step), jax.jit(finish))
+    return _SMCPrograms(jax.jit(start), jax.jit(partial(_step, density, options)), jax.jit(finish))
+
+
+def _step(density: Density, options: SMCOptions, current: _Particles, data: Data) -> _Particles:
+    """Return the particles at the next temperature: weighted, resampled and moved by HMC."""
+    import blackjax  # only some samplers need this import
+    from blackjax.smc import base, resampling
+
+    hmc, count = blackjax.hmc.build_kernel(), options.draws
+
+    def log_likelihood(z: jax.Array) -> jax.Array:
+        return jnp.maximum(density.log_likelihood(z, data), _LOWEST)
+
+    step_key, next_key = jax.random.split(jax.random.wrap_key_data(current.key_data))
+    particles, temperature = current.particles, current.temperature
+    heights = jax.vmap(log_likelihood)(particles)
+    increment = _increment(heights, 1.0 - temperature, options.survivors)
+    # Sums of increments may miss 1 by round-off.
+    last = increment >= 1.0 - temperature
+    temperature = jnp.where(last, 1.0, temperature + increment)
+    log_weights = increment * heights
+    weights = jax.nn.softmax(log_weights)
+    covariance = jnp.atleast_2d(jnp.cov(particles, rowvar=False, aweights=weights))
+
+    def transition(rng_key: jax.Array, state: Any, log_density: Any) -> Any:
+        # Trajectories of one length could return to their start, again and again.
+        length_key, hmc_key = jax.random.split(rng_key)
+        size = current.step_size * jax.random.uniform(length_key, minval=0.5)
+        return hmc(hmc_key, state, log_density, size, covariance, options.leapfrogs)
+
+    move, _ = base.update_and_take_last(
+        blackjax.hmc.init,
+        lambda z: density.log_prior(z) + temperature * log_likelihood(z),
+        transition,
+        options.transitions,
+        count,
+    )
+    resampled, info = base.step(
+        step_key,
+        base.SMCState(particles, weights, {}),
+        move,
+        lambda particles: jnp.zeros(len(particles)),
+        resampling.systematic,
+    )
+    rates = info.update_info.acceptance_rate.mean(axis=1)
+    return _Particles(
+        jax.random.key_data(next_key),
+        resampled.particles,
+        temperature,
+        current.log_evidence + logsumexp(log_weights) - jnp.log(count),
+        current.step_size * jnp.exp(rates.mean() - options.target_accept),
+        rates,
+        current.steps + 1,
+    )
 
 
 def _increment(heights: jax.Array, remaining: jax.Array, survivors: float) -> jax.Array:

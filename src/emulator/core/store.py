@@ -9,9 +9,10 @@ import hashlib
 import json
 import math
 import os
+import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -60,9 +61,13 @@ def write_atomically(path: str | Path, content: bytes | memoryview) -> None:
 def write_netcdf(path: str | Path, content: Any) -> None:
     """Write a Dataset or DataTree of xarray as netCDF.
 
-    It is made in memory first: a disk that is full would end the process inside HDF5.
+    It is made in memory first: a disk that is full would end the process inside HDF5. In a worker
+    of Dask, xarray would ask the cluster for a lock, which what is in memory does not need.
     """
-    write_atomically(path, content.to_netcdf(engine="h5netcdf"))
+    dask = sys.modules.get("dask")
+    with nullcontext() if dask is None else dask.config.set(scheduler="synchronous"):
+        made = content.to_netcdf(engine="h5netcdf")
+    write_atomically(path, made)
 
 
 def to_json(content: Any) -> str:

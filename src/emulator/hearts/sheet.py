@@ -62,14 +62,7 @@ def mesh_sheet(
     if not pads or {*pads} & {*_PLANES, "edge"}:
         raise InputError("sheet: give one pad or more, not called edge, bottom or top")
     around, *glued = (_polygon(p, n) for n, p in {"outline": outline, **pads}.items())
-    most = 8.0 * size if coarsest is None else max(coarsest, size)
-    low = np.min([pad.min(axis=0) for pad in glued], axis=0)
-    high = np.max([pad.max(axis=0) for pad in glued], axis=0)
-
-    def edge(x: float, y: float) -> float:
-        beyond = np.maximum(0.0, np.maximum(low - (x, y), np.array([x, y]) - high))
-        return min(size + _GROWTH * float(np.hypot(*beyond)), most)
-
+    edge = _growing(glued, size, 8.0 * size if coarsest is None else max(coarsest, size))
     sides = [
         np.vstack([_divided(a, b, edge) for a, b in _sides(loop)]) for loop in (around, *glued)
     ]
@@ -83,6 +76,21 @@ def mesh_sheet(
     for name, pad in zip(pads, glued, strict=True):
         sets[name] = columns[within(plane, pad) | _close(plane, pad, slack), -1]
     return body(nodes, extrude(columns, triangles), planes, sets, None, order)
+
+
+def _growing(pads: list[np.ndarray], size: float, most: float) -> Callable[[float, float], float]:
+    """Return the length of edges in mm at a point (x, y): ``size`` in the box of all pads.
+
+    Beyond it grows with the distance, up to ``most``.
+    """
+    low = np.min([pad.min(axis=0) for pad in pads], axis=0)
+    high = np.max([pad.max(axis=0) for pad in pads], axis=0)
+
+    def edge(x: float, y: float) -> float:
+        beyond = np.maximum(0.0, np.maximum(low - (x, y), np.array([x, y]) - high))
+        return min(size + _GROWTH * float(np.hypot(*beyond)), most)
+
+    return edge
 
 
 def regions_within(mesh: Mesh, polygons: Mapping[int, np.ndarray]) -> np.ndarray:

@@ -94,14 +94,7 @@ def draft_scene(
         that cannot be supported.
     """
     mesh_path, out = Path(mesh_path), Path(out)
-    if out.suffix != ".toml":
-        raise InputError(f"--out {out}: the file name must end in .toml")
-    if out.exists():
-        raise InputError(f"{out} is there already; remove it or give --out another name")
-    if unit is not None:
-        look_up(IN_MM, unit, "unit")
-    if law is not None:
-        find_law(law)  # refused before anything is written
+    _check(out, unit, law)
     body = read_body(mesh_path)
     notes: list[str] = []
     if unit is None:
@@ -117,10 +110,7 @@ def draft_scene(
         notes.append(quality.sentence())
     walls = _walls(mesh)
     if law is None:
-        why = "the mesh has fibres" if body.fibres is not None else "its walls are named"
-        fibrous = body.fibres is not None or walls is not None
-        law = "holzapfel_ogden" if fibrous else "neo_hookean"
-        notes.append(f"law {law}: {why if fibrous else 'the mesh has no fibres'}")
+        law = _usual_law(notes, fibres=body.fibres is not None, walls=walls is not None)
     material, support = find_law(law), _support(mesh, notes)
     head = [
         f'law = "{material.name}"   # see docs/extending.md for others',
@@ -151,6 +141,26 @@ def draft_scene(
     if mesh_name == f"{mesh_path.stem}_mm.vtu" and unit != "mm":
         out.with_name(mesh_name).unlink()
     raise InputError(f"mesh file {mesh_path}: {failure}")
+
+
+def _check(out: Path, unit: str | None, law: str | None) -> None:
+    """Refuse what is wrong before anything is written."""
+    if out.suffix != ".toml":
+        raise InputError(f"--out {out}: the file name must end in .toml")
+    if out.exists():
+        raise InputError(f"{out} is there already; remove it or give --out another name")
+    if unit is not None:
+        look_up(IN_MM, unit, "unit")
+    if law is not None:
+        find_law(law)
+
+
+def _usual_law(notes: list[str], *, fibres: bool, walls: bool) -> str:
+    """Return the law of a mesh that has fibres, or walls between which they can be computed."""
+    why = "the mesh has fibres" if fibres else "its walls are named"
+    law = "holzapfel_ogden" if fibres or walls else "neo_hookean"
+    notes.append(f"law {law}: {why if fibres or walls else 'the mesh has no fibres'}")
+    return law
 
 
 def guessed_unit(extent: float) -> tuple[str, str]:

@@ -209,6 +209,16 @@ def test_nuts_is_taken_where_importance_sampling_does_not_work(
     assert len(asked) == 1
 
 
+def test_few_draws_are_taken_from_populations_that_agree(beam):
+    """120 draws can neither reach 400 effective ones nor an R-hat of 1.008, right as they are."""
+    model, data = linear_problem(beam)
+    model, checked = model.given(data)
+    few = AUTO.sample(density_of(model), checked, AutoOptions(draws=60, chains=2), Context())
+    assert few.attributes[SAMPLED_BY] == "importance"
+    assert few.z.shape == (2, 60, 2)
+    assert few.statistics["lp"].shape == (2, 60)
+
+
 class Refusing:
     """Importance sampling that gives up."""
 

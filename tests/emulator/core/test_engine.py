@@ -8,10 +8,12 @@ from operator import neg
 
 import numpy as np
 import pytest
+import xarray as xr
 
 import emulator as em
 from emulator.core.engine import Engine, engine_of
 from emulator.core.errors import InputError, SolverError
+from emulator.core.store import write_netcdf
 from emulator.fem.campaign import run_campaign
 from emulator.fem.campaign.designs import sobol
 
@@ -144,7 +146,7 @@ def test_what_is_no_engine_is_refused(words, complaint):
         engine_of(words)
 
 
-def test_a_cluster_of_dask_gives_the_same(beam):
+def test_a_cluster_of_dask_gives_the_same(beam, tmp_path):
     distributed = pytest.importorskip("distributed")
     scene, thetas = beam
     with (
@@ -152,6 +154,10 @@ def test_a_cluster_of_dask_gives_the_same(beam):
         distributed.Client(made) as client,
     ):
         by_dask = run_campaign(em.Simulator(scene, executor=client.get_executor()), thetas)
+        # xarray would ask for a lock that this cluster does not know.
+        made = xr.Dataset({"x": ("n", np.arange(3.0))})
+        client.submit(write_netcdf, tmp_path / "x.nc", made).result()
+    assert xr.load_dataset(tmp_path / "x.nc", engine="h5netcdf").identical(made)
     by_threads = run_campaign(em.Simulator(scene, executor=Bare()), thetas)
     assert np.array_equal(by_dask.displacement, by_threads.displacement)
 

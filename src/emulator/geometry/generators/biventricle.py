@@ -211,12 +211,8 @@ def biventricle(
     septum = Septum(left, right)
     opened, on_base, in_disc, in_septum = _open_disc(septum, rings, around, strips, grading)
     septal, free = np.unique(opened.inner), np.setdiff1d(opened.inner, opened.line)
-    # Columns of nodes. The free wall's are -1 off it; along the line that it stands on, its nodes
-    # are the left wall's outermost.
     wall = stacked(len(in_disc), through)
-    sheet = np.full((len(in_disc), strips + 1), -1)
-    sheet[opened.line] = wall[opened.levels, -1]
-    sheet[free] = wall.size + np.arange(len(free) * (strips + 1)).reshape(-1, strips + 1)
+    sheet = _sheet_columns(opened, free, wall, strips)
     in_wall, in_sheet = _in_columns(wall, in_disc), _in_columns(sheet[septal], in_septum[septal])
     on_wall = wall_midpoints(left, *in_wall.T)
 
@@ -281,6 +277,22 @@ def _open_disc(
     rest = np.setdiff1d(opened.outer, fixed)
     r[rest], phi[rest] = np.hypot(x[rest], y[rest]), np.arctan2(y[rest], x[rest])
     return opened, on_base, np.column_stack([r, phi]), np.column_stack([xi, eta])
+
+
+def _sheet_columns(
+    opened: Footprint, free: np.ndarray, wall: np.ndarray, strips: int
+) -> np.ndarray:
+    """Return the columns of nodes (v, strips + 1) of the free wall, -1 off it.
+
+    Along the line that it stands on, its nodes are the left wall's outermost.
+
+    free : the vertices of the free wall that are not on that line.
+    wall : the columns of nodes (v, layers + 1) of the left wall.
+    """
+    sheet = np.full((len(wall), strips + 1), -1)
+    sheet[opened.line] = wall[opened.levels, -1]
+    sheet[free] = wall.size + np.arange(len(free) * (strips + 1)).reshape(-1, strips + 1)
+    return sheet
 
 
 def _in_columns(columns: np.ndarray, places: np.ndarray) -> np.ndarray:
