@@ -9,8 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import jax.numpy as jnp
 import numpy as np
 
+from emulator.mechanics.kinematics import cofactor, determinant
 from emulator.neighbours.decks import materials
 from emulator.neighbours.decks.deck import (
     AXES,
@@ -259,7 +261,9 @@ class _FebioReading:
             raise self.file.error(tag.line, "E and v of the material are no positive stiffness")
         shear = [number(self.file, tag, name) for name in ("G12", "G23", "G31")]
         c, kappa = (number(self.file, tag, name) for name in ("c", "k"))
-        return materials.fung(c, np.linalg.inv(compliance), shear, kappa)
+        S = jnp.asarray(compliance)
+        stiffness = np.asarray(cofactor(S) / determinant(S))  # S is symmetric
+        return materials.fung(c, stiffness, shear, kappa)
 
     # Supports and loads.
 
