@@ -9,6 +9,8 @@ import inspect
 import json
 import re
 import shutil
+import sys
+import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -16,18 +18,24 @@ import calibrate
 import emulator
 
 HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))  # the extensions below
 ROOT = HERE.parent
 GENERATED = HERE / "generated"
 
 project = "soft-tissue-calibrate"
 author = "The soft-tissue-calibrate authors"
+copyright = f"2026, {author}; MIT licence"
 release = emulator.__version__
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
-myst_enable_extensions = ["dollarmath"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions += ["formulas", "provenance", "links"]
+myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "generated/gallery.md"]
 html_theme = "furo"
 html_title = project
+html_math_renderer = "mathml"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 html_extra_path = ["llms.txt"]
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"
@@ -91,7 +99,7 @@ def _notebook(path: Path) -> None:
     target.mkdir(exist_ok=True)
     parts = []
     for number, cell in enumerate(json.loads(path.read_text(encoding="utf-8"))["cells"]):
-        source = "".join(cell["source"])
+        source = "".join(cell["source"]).replace("](../docs/", "](../../")
         parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
         for output in cell.get("outputs", []):
             data = output.get("data", {})
@@ -105,12 +113,26 @@ def _notebook(path: Path) -> None:
     (target / f"{path.stem}.md").write_text("\n\n".join(parts) + "\n", encoding="utf-8")
 
 
+def _gallery() -> str:
+    """Return the cards of ``gallery.toml``: a picture, a sentence and the command that makes it."""
+    results = tomllib.loads((HERE / "gallery.toml").read_text(encoding="utf-8"))["results"]
+    cards = [
+        f":::{{container}} card\n[![{r['alt']}]({r['picture']})]({r['page']})\n\n"
+        f"**[{r['title']}]({r['page']}).** {r['sentence']}\n\n```sh\n{r['command']}\n```\n:::\n"
+        for r in results
+    ]
+    return "::::{container} gallery\n" + "\n".join(cards) + "::::\n"
+
+
 def _generate() -> None:
     shutil.rmtree(GENERATED, ignore_errors=True)
     GENERATED.mkdir()
     for package in (emulator, calibrate):
         page = GENERATED / f"{package.__name__}.rst"
         page.write_text("\n".join(_public(package)), encoding="utf-8")
+    (GENERATED / "gallery.md").write_text(_gallery(), encoding="utf-8")
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").replace("](docs/", "](../")
+    (GENERATED / "changelog.md").write_text(changes, encoding="utf-8")
     for path in sorted(ROOT.glob("notebooks/*.ipynb")):
         _notebook(path)
     studies = sorted(path.parent for path in ROOT.glob("studies/*/README.md"))

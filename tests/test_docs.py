@@ -43,7 +43,8 @@ def test_the_docs_have_every_kind_of_error_that_numbers_share():
 
 @pytest.mark.slow
 def test_the_site_builds_without_a_warning(tmp_path):
-    pytest.importorskip("sphinx", reason="no sphinx here")
+    for package in ("sphinx", "latex2mathml"):
+        pytest.importorskip(package, reason=f"no {package} here")
     words = ["-W", "--keep-going", "-q", "-b", "html", ROOT / "docs", tmp_path]
     command = [sys.executable, "-m", "sphinx", *map(str, words)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -55,6 +56,12 @@ def test_the_site_builds_without_a_warning(tmp_path):
     for path in (ROOT / "docs").glob("*.md"):  # as llms.txt links them
         assert (tmp_path / path.name).read_bytes() == path.read_bytes()
     assert (tmp_path / "llms.txt").is_file()
+    notation = (tmp_path / "notation.html").read_text(encoding="utf-8")
+    assert notation.count("<math ") > 40
+    assert re.findall(r'<script[^>]+src="(?:https?:)?//', notation) == []
+    front = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert len(re.findall(r'<div class="card docutils', front)) == 12
+    assert "Copyright &#169; 2026" in front
 
 
 def test_no_line_of_prose_is_wider_than_100_characters():
@@ -124,7 +131,7 @@ def shell_lines(page):
     return [words for words in commands if words]
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/quickstart.md", *FRONT])
+@pytest.mark.parametrize("page", ["README.md", "docs/quickstart.md", "docs/tutorial.md", *FRONT])
 def test_command_lines_are_words_that_the_commands_know(page):
     """Commands of this package are parsed; targets, modules and files of the others exist."""
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")

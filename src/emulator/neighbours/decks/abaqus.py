@@ -10,6 +10,7 @@ import numpy as np
 
 from emulator.core.errors import InputError
 from emulator.geometry.file_formats import ABAQUS_FACES
+from emulator.mechanics.laws import find_law
 from emulator.neighbours.decks import materials
 from emulator.neighbours.decks.deck import (
     Deck,
@@ -97,7 +98,7 @@ class _AbaqusReading:
             for line, row in block.numbered():
                 self._read_condition(block, line, [*row, "", "", "", ""], scale, material)
         body = self.body
-        axes = self._axes()
+        axes = self._axes(material)
         mesh = assemble(self.file, body.nodes, body.elements, body.node_sets, body.facet_sets)
         return finished("Abaqus", self.file, mesh, material, self.prescribed, self.loads, axes)
 
@@ -120,6 +121,8 @@ class _AbaqusReading:
                 laws.append(("small_strain_E_nu", {"E": E, "nu": nu}, block.line, ""))
             elif block.keyword == "HYPERELASTIC":
                 laws.append((*self._isotropic(block, values), block.line, materials.QUADRATIC))
+            elif "FUNG-ORTHOTROPIC" in block.options:
+                laws.append((*self._fung(block, values), block.line, ""))
             else:
                 laws.append((*self._families(block, values), block.line, ""))
         if len(laws) != 1:
@@ -130,7 +133,8 @@ class _AbaqusReading:
         ((law, parameters, line, bulk),) = laws
         if not self.finite and self.steps and law != "small_strain_E_nu":
             self.file.note("the deck's step has no NLGEOM; the scene has finite strains")
-        return Material(law, parameters, line, density, bulk)
+        isochoric = law == "fung_orthotropic"
+        return Material(law, parameters, line, density, bulk, isochoric)
 
     def _isotropic(self, block: Block, values: list[float]) -> Parameters:
         order = self.file.keys([block.options.get("N") or "1"], block.line)[0]
@@ -181,6 +185,13 @@ class _AbaqusReading:
         angle = 0.5 * float(np.degrees(np.arccos(one @ other)))
         return materials.fibre_families(2.0 * c_10, k_1, k_2, angle, dispersion, 2.0 / d)
 
+    def _fung(self, block: Block, values: list[float]) -> Parameters:
+        if len(values) < 11 or values[9] <= 0.0 or values[10] <= 0.0:
+            raise self.file.error(block.line, "expected nine b_ijkl, c and D, both above 0")
+        b_11, b_12, b_22, b_13, b_23, b_33, s_12, s_13, s_23, c, d = values[:11]
+        normal = c * np.array([[b_11, b_12, b_13], [b_12, b_22, b_23], [b_13, b_23, b_33]])
+        return materials.fung(c, normal, [c * s for s in (s_12, s_23, s_13)], 2.0 / d)
+
     # Directions.
 
     def _orientation(self) -> Block | None:
@@ -197,13 +208,20 @@ class _AbaqusReading:
         return np.array([self.file.unit(np.array(self.file.numbers(row[:3], k, 3)), k)
                          for k, row in rows])  # fmt: skip
 
-    def _axes(self) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """Return the bisectors of the two families of fibres in each element."""
+    def _axes(self, material: Material) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """Return the local axes of each element, or the bisectors of its two families of fibres."""
         table = self._orientation()
-        if table is None or "LOCAL DIRECTIONS" not in table.options:
+        if table is None or not find_law(material.law).fibres:
             return None, None
-        one, other = self._directions(table.line)
-        bisectors = [self.file.unit(one + sign * other, table.line) for sign in (1.0, -1.0)]
+        bisectors = [np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])]
+        if "LOCAL DIRECTIONS" in table.options:
+            one, other = self._directions(table.line)
+            bisectors = [self.file.unit(one + sign * other, table.line) for sign in (1.0, -1.0)]
+        kinds = ("SYSTEM", "RECTANGULAR"), ("DEFINITION", "COORDINATES")
+        if any(table.options.get(option, usual).upper() != usual for option, usual in kinds):
+            raise self.file.error(
+                table.line, f"{table.described()}; expected SYSTEM=RECTANGULAR by coordinates"
+            )
         line, row = next(table.numbered())
         rows = {"": self._frame(row, line)} if len(row) > 3 else {}
         if not rows:

@@ -293,6 +293,8 @@ def only_material(
     for quantity in LAWS[first.law].quantities:
         if fault := quantity.value_fault(first.values[quantity.name]):
             raise file.error(first.line, fault)
+    if fault := first.fault():
+        raise file.error(first.line, fault)
     for sentence in first.notes():
         file.note(sentence)
     return first

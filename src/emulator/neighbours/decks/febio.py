@@ -9,8 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import jax.numpy as jnp
 import numpy as np
 
+from emulator.mechanics.kinematics import cofactor, determinant
 from emulator.neighbours.decks import materials
 from emulator.neighbours.decks.deck import (
     AXES,
@@ -23,7 +25,7 @@ from emulator.neighbours.decks.deck import (
     point_forces,
     weight,
 )
-from emulator.neighbours.decks.materials import Material
+from emulator.neighbours.decks.materials import Material, Parameters
 from emulator.neighbours.decks.tags import Tag, number, read_tags
 from emulator.scenes.loads import DeadPressure, FollowerPressure, Traction
 from emulator.scenes.part import Load
@@ -40,9 +42,12 @@ _LAWS = {
     "Mooney-Rivlin": ("mooney_rivlin", {"c_10": "c1", "c_01": "c2", "kappa": "k"}),
 }
 _OGDEN, _FAMILIES = "Ogden", "Holzapfel-Gasser-Ogden"
+_FUNG = {"Fung-ortho-compressible": False, "Fung orthotropic": True}
+"""Whether Fung's exponential is of the isochoric strain."""
 _PARAMETERS = {
     "density", "mat_axis", "fiber", "pressure_model", "E", "v", "G", "k", "c", "k1", "k2", "gamma",
     "kappa", *(f"{letter}{k}" for letter in "cm" for k in range(1, 7)),
+    "E1", "E2", "E3", "G12", "G23", "G31", "v12", "v23", "v31",
 }  # fmt: skip
 _BULKS = {
     "default": materials.LOGARITHMIC, "0": materials.LOGARITHMIC, "NIKE3D": "", "1": "",
@@ -230,8 +235,10 @@ class _FebioReading:
         elif kind == _FAMILIES:
             numbers = [number(self.file, tag, n) for n in ("c", "k1", "k2", "gamma", "kappa", "k")]
             law, values = materials.fibre_families(*numbers)
+        elif kind in _FUNG:
+            law, values = self._fung(tag)
         else:
-            known = ", ".join([*_LAWS, _OGDEN, _FAMILIES])
+            known = ", ".join([*_LAWS, _OGDEN, _FAMILIES, *_FUNG])
             raise self.file.error(
                 tag.line, f"material '{kind}' is no law of this package; it reads {known}"
             )
@@ -240,7 +247,23 @@ class _FebioReading:
                 self.file.skip(child.line, f"{child.described()} of the material")
         model = tag.words("pressure_model", "3" if kind == _FAMILIES else "0")
         bulk = _BULKS.get(model, f"pressure_model {model}") if "kappa" in values else ""
-        return Material(law, values, tag.line, number(self.file, tag, "density", 1.0), bulk)
+        density = number(self.file, tag, "density", 1.0)
+        return Material(law, values, tag.line, density, bulk, _FUNG.get(kind, False))
+
+    def _fung(self, tag: Tag) -> Parameters:
+        E = [number(self.file, tag, name) for name in ("E1", "E2", "E3")]
+        compliance = np.diag(1.0 / np.array(E))
+        for row, name in enumerate(("v12", "v23", "v31")):
+            column = (row + 1) % 3
+            ratio = -number(self.file, tag, name) / E[row]
+            compliance[row, column] = compliance[column, row] = ratio
+        if np.linalg.eigvalsh(compliance)[0] <= 0.0:
+            raise self.file.error(tag.line, "E and v of the material are no positive stiffness")
+        shear = [number(self.file, tag, name) for name in ("G12", "G23", "G31")]
+        c, kappa = (number(self.file, tag, name) for name in ("c", "k"))
+        S = jnp.asarray(compliance)
+        stiffness = np.asarray(cofactor(S) / determinant(S))  # S is symmetric
+        return materials.fung(c, stiffness, shear, kappa)
 
     # Supports and loads.
 

@@ -17,12 +17,20 @@ FEBio Ogden, c_i, m_i, k                 ``ogden_N``: mu_i = c_i / 2, alpha_i = 
                                          from :math:`\sum c_i / m_i^2 (\sum \bar\lambda^{m_i} - 3)`
 FEBio Holzapfel-Gasser-Ogden             the same: c, k_1 = k1, k_2 = k2, angle = gamma (degrees),
                                          dispersion = kappa, kappa = k
+FEBio Fung-ortho-compressible, E, G, v   ``fung_orthotropic`` without a matrix, kappa = k; of K, the
+                                         inverse of the compliance of E and v: b_1, b_2, b_3 =
+                                         K_11, K_22, K_33 over c, b_4, b_5, b_6 = K_12, K_23, K_31
+                                         over c; b_7, b_8, b_9 = G12, G23, G31 over c
+FEBio Fung orthotropic                   the same, of the isochoric strain there
 Abaqus neo Hooke, C10, D1                ``neo_hookean_split``: mu = 2 C10, kappa = 2 / D1
 Abaqus Mooney-Rivlin, C10, C01, D1       ``mooney_rivlin``, kappa = 2 / D1
 Abaqus Yeoh, C10, C20, C30, D1           ``yeoh``, kappa = 2 / D1
 Abaqus Ogden, mu_i, alpha_i, D_i         ``ogden_N``, the same energy, kappa = 2 / D1
 Abaqus Holzapfel, C10, D, k1, k2, kappa  c = 2 C10, k_1, k_2, dispersion, kappa = 2 / D; the angle
                                          is half of that between the two local directions
+Abaqus Fung-orthotropic, b_ijkl, c, D    ``fung_orthotropic`` without a matrix: b_1 to b_9 = b_1111,
+                                         b_2222, b_3333, b_1122, b_2233, b_1133, b_1212, b_2323,
+                                         b_1313, of the isochoric strain there; kappa = 2 / D
 Abaqus elastic, E, nu, no NLGEOM         ``small_strain_E_nu``
 svMultiPhysics neoHookean, E, nu         ``neo_hookean_split``: mu = E / 2(1 + nu), kappa is the
                                          penalty parameter, or else E / 3(1 - 2 nu)
@@ -31,9 +39,10 @@ svMultiPhysics HolzapfelOgden            ``holzapfel_ogden_orthotropic``: kappa 
 
 Laws here have :math:`U_1` (neo_hookean_E_nu has none of them). FEBio's uncoupled materials have
 :math:`U_0` unless ``pressure_model`` names another one, its Holzapfel-Gasser-Ogden and
-svMultiPhysics' ST91 :math:`U_1`, Abaqus :math:`U_2`, but its Holzapfel :math:`U_1`, M94
+svMultiPhysics' ST91 :math:`U_1`, Abaqus :math:`U_2`, but its Holzapfel and Fung :math:`U_1`, M94
 :math:`U_3`. All have the bulk modulus :math:`\kappa`: they agree to second order in J - 1, and a
-note says where one stands for another.
+note says where one stands for another. Fung's exponential is of the whole strain here. A deck's of
+the isochoric strain stands for it where the bulk modulus is so large that both strains are one.
 
 Sources: FEBio User Manual 4, "Uncoupled materials", and FEUncoupledMaterial.h; Abaqus Theory Guide,
 4.6.1 and 4.6.3; Abaqus Analysis User's Guide, "Hyperelastic behavior of rubberlike materials";
@@ -45,6 +54,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 SAME = "kappa/4 (J^2 - 1 - 2 ln J)"
 LOGARITHMIC, QUADRATIC = "kappa/2 (ln J)^2", "kappa/2 (J - 1)^2"
 OTHER = "kappa (J - 1 - ln J)"
@@ -53,11 +64,16 @@ Parameters = tuple[str, dict[str, float]]
 """The name of a law, and its parameters."""
 
 
+NEARLY_INCOMPRESSIBLE = 100.0
+"""Bulk modulus over the stiffness at rest above which the isochoric strain is the strain."""
+
+
 class Material(NamedTuple):
     """A law, its parameters by name, and the line of the deck that has it.
 
     density : mass density in the deck's unit, or None.
     bulk : the energy of volume change there, in words; empty where it is that of the law here.
+    isochoric : whether the exponential is of the isochoric strain there, of the whole one here.
     """
 
     law: str
@@ -65,15 +81,33 @@ class Material(NamedTuple):
     line: int
     density: float | None = None
     bulk: str = ""
+    isochoric: bool = False
+
+    def fault(self) -> str | None:
+        """Return why the law cannot stand for the deck's, else None."""
+        stiffness = [self.values.get(f"b_{k}", 0.0) for k in range(1, 10)]
+        least = NEARLY_INCOMPRESSIBLE * self.values.get("C", 0.0) * max(stiffness)
+        if not self.isochoric or self.values["kappa"] >= least:
+            return None
+        return (
+            f"Fung's exponential is of the isochoric strain in the deck and of the whole strain "
+            f"here; they are one only for a bulk modulus of {least:g} or more"
+        )
 
     def notes(self) -> list[str]:
-        """Return a sentence where the energies differ."""
-        if not self.bulk:
-            return []
-        return [
-            f"volume changes cost {self.bulk} in the deck and {SAME} here: the same bulk modulus, "
-            "other energies of large volume changes"
-        ]
+        """Return a sentence for each difference of the energies."""
+        sentences = []
+        if self.bulk:
+            sentences.append(
+                f"volume changes cost {self.bulk} in the deck and {SAME} here: the same bulk "
+                "modulus, other energies of large volume changes"
+            )
+        if self.isochoric:
+            sentences.append(
+                "Fung's exponential is of the isochoric strain in the deck and of the whole strain "
+                "here: they differ by the volume change, which this bulk modulus keeps small"
+            )
+        return sentences
 
 
 def ogden(mu: Sequence[float], alpha: Sequence[float], kappa: float) -> Parameters:
@@ -103,3 +137,17 @@ def split_neo_hookean(E: float, nu: float, penalty: float | None) -> Parameters:
     mu = E / (2.0 * (1.0 + nu))
     kappa = E / (3.0 * (1.0 - 2.0 * nu)) if penalty is None else penalty
     return "neo_hookean_split", {"mu": mu, "kappa": kappa}
+
+
+def fung(c: float, normal: np.ndarray, shear: Sequence[float], kappa: float) -> Parameters:
+    """Return law and parameters of Fung's exponential.
+
+    Parameters
+    ----------
+    normal : the stiffness (3, 3) of normal strains.
+    shear : those of shear between the axes 12, 23 and 31, in the unit of ``c``.
+    """
+    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0))
+    b = [*(float(normal[pair]) / c for pair in pairs), *(G / c for G in shear)]
+    exponents = {f"b_{k}": value for k, value in enumerate(b, start=1)}
+    return "fung_orthotropic", {"C": c, **exponents, "mu": 0.0, "kappa": kappa}

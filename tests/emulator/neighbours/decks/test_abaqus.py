@@ -5,7 +5,16 @@ import pytest
 
 import deck_support as decks
 import emulator as em
-from deck_support import BLOCK, QUADRATIC, SLIDING, abaqus, abaqus_supports, drafted, imbalance
+from deck_support import (
+    BLOCK,
+    QUADRATIC,
+    SLIDING,
+    abaqus,
+    abaqus_supports,
+    complaint,
+    drafted,
+    imbalance,
+)
 
 SMALLEST = 1e-8  # mm and mN
 NEO_HOOKE = "*Hyperelastic, neo hooke\n2.0, 0.025"
@@ -248,3 +257,35 @@ def test_a_mesh_of_abaqus_without_a_material_is_a_mesh(tmp_path, capsys):
     (tmp_path / "mesh.inp").write_text(decks.abaqus_mesh())
     assert main(["init", str(tmp_path / "mesh.inp")]) == 0
     assert "law neo_hookean: the mesh has no fibres" in capsys.readouterr().out
+
+
+FUNG = "*Anisotropic hyperelastic, fung-orthotropic\n9., 1., 5., 0.7, -0.6, 4., 2., 2.5\n3., 2., {}"
+LOCAL = "*Orientation, name=Axes\n0., 1., 0., -1., 0., 0."
+
+
+def test_fungs_constants_in_the_axes_of_an_orientation(tmp_path):
+    """b_1133 is our b_6, b_1313 our b_9; 2 / D = 1e4 is 555 times the largest stiffness, 18."""
+    text = abaqus(
+        FUNG.format(2e-4), abaqus_supports() + PULL, section=", orientation=Axes", more=LOCAL
+    )
+    draft = drafted(tmp_path / "f.inp", text)
+    read = draft.scene.resolve(draft.scene.centre)
+    expected = (9.0, 5.0, 4.0, 1.0, -0.6, 0.7, 2.0, 3.0, 2.5)
+    values = [float(read[f"b_{k}"]) for k in range(1, 10)]
+    np.testing.assert_allclose(values, expected, rtol=1e-12)
+    assert [float(read[name]) for name in ("C", "mu", "kappa")] == pytest.approx([2.0, 0.0, 1e4])
+    np.testing.assert_allclose(draft.scene.fibres, np.tile([0.0, 1.0, 0.0], (12, 1)))
+    np.testing.assert_allclose(draft.scene.sheets, np.tile([-1.0, 0.0, 0.0], (12, 1)))
+    assert any("isochoric strain" in note for note in draft.notes)
+
+
+def test_what_is_no_fung_law_of_the_whole_strain_is_refused(tmp_path):
+    options = {"section": ", orientation=Axes", "more": LOCAL}
+    soft = abaqus(FUNG.format(0.02), abaqus_supports(), **options)
+    assert "bulk modulus of 1800 or more" in complaint(tmp_path / "s.inp", soft)
+    turned = LOCAL.replace("Axes", "Axes, system=cylindrical")
+    text = abaqus(FUNG.format(2e-4), abaqus_supports(), **options | {"more": turned})
+    assert "expected SYSTEM=RECTANGULAR" in complaint(tmp_path / "c.inp", text)
+    short = FUNG.format(2e-4).replace("3., 2., ", "")
+    message = complaint(tmp_path / "n.inp", abaqus(short, abaqus_supports(), **options))
+    assert "nine b_ijkl" in message

@@ -167,3 +167,24 @@ def test_what_is_not_understood_is_listed_by_its_line(tmp_path):
     ]  # fmt: skip
     written = Path(draft.path).read_text()
     assert all(f"# - {sentence}" in written for sentence in draft.unread)
+
+
+def test_fungs_exponential_of_an_isotropic_material(tmp_path):
+    """With G = E / 2 (1 + v), c Q = lam (tr E)^2 + 2 mu tr E^2 of the Green-Lagrange strain."""
+    pull = '<bc type="prescribe" node_set="right"><dof>x</dof><scale lc="1">0.2</scale></bc>'
+    moduli = "".join(f"<E{k}>30</E{k}>" for k in (1, 2, 3))
+    moduli += "".join(f"<G{k}>12</G{k}><v{k}>0.25</v{k}>" for k in (12, 23, 31))
+    axes = '<mat_axis type="vector"><a>0,1,0</a><d>1,0,0</d></mat_axis>'
+    material = f'type="Fung-ortho-compressible">{moduli}<c>4</c><k>90</k>{axes}'
+    text = febio("3.0", material, febio_supports("3.0") + pull)
+    draft = drafted(tmp_path / "f.feb", text)
+
+    def energy(*stretches):
+        E = [(x**2 - 1.0) / 2.0 for x in stretches]
+        Q = (12.0 * sum(E) ** 2 + 24.0 * sum(e**2 for e in E)) / 4.0
+        J = stretches[0] * stretches[1] * stretches[2]
+        return 2.0 * (np.exp(Q) - 1.0) + decks.volumetric(J, 90.0)
+
+    stretches = decks.pulled(energy, along=1.1)
+    assert decks.judged(draft.scene, energy, stretches) < SMALLEST
+    assert any("kappa/2 (ln J)^2 in the deck" in note for note in draft.notes)
