@@ -69,8 +69,10 @@ class Cells(NamedTuple):
             ) from error
 
 
-def read_cells(path: Path) -> Cells:
+def read_cells(path: Path, *, unloading: bool = False) -> Cells:
     """Return the table of a CSV file or a spreadsheet.
+
+    unloading : whether rows of unloading are data; else they are left out.
 
     Raises
     ------
@@ -116,7 +118,7 @@ def read_cells(path: Path) -> Cells:
     if words and not rows:
         raise InputError(f"data file {path}: names of columns, and no row below them")
     every = len(rows)
-    if BRANCH in words:
+    if BRANCH in words and not unloading:
         rows = {k: row for k, row in rows.items() if row[BRANCH].lower() != UNLOADING}
         if not rows:
             raise InputError(

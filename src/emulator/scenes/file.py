@@ -110,7 +110,7 @@ def _on_mesh(
     """Return the fields of a scene that its body, its loads and its supports give."""
     if not file.supports:
         raise source.error("key 'supports' is missing; expected tables [[supports]]")
-    for table in ("grips", "tube"):
+    for table in ("grips", "tube", "viscosity"):
         if table in source.data:
             problem = f"only a specimen has {table}; give its table as 'specimen'"
             raise source.error(problem, (table,))

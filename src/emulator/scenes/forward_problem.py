@@ -11,13 +11,14 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar
 
 import jax
 import numpy as np
 
-from emulator.core.cells import Cells
+from emulator.core.cells import Cells, read_cells
 from emulator.core.display import TableRepr
 from emulator.core.errors import InputError
 from emulator.geometry.fibres import check_across, checked_directions
@@ -93,6 +94,10 @@ class ForwardProblem(TableRepr):
     @abstractmethod
     def tissue_at(self, theta: jax.Array) -> Tissue:
         """Return material data at ``theta`` (p,), stacked over elements and points, or states."""
+
+    def read_table(self, path: Path) -> Cells:
+        """Return the rows of a data file that are data of this problem."""
+        return read_cells(path)
 
     # Theta: the parameters, in their box.
 
