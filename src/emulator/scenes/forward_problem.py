@@ -165,6 +165,11 @@ class ForwardProblem(TableRepr):
         add_owners(owners, "the fibres'", self.angles)
         return owners
 
+    @property
+    def tissue_parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that are of the material, wherever it is."""
+        return self.law.parameters
+
     def _check_directions(self, count: int, points: int, loads: Sequence[Load] = ()) -> None:
         """Refuse directions and angles that do not fit; keep them as frozen arrays.
 

@@ -179,6 +179,12 @@ class Specimen(ForwardProblem):
         add_owners(owners, "the scene's", [] if self.viscosity is None else [self.viscosity])
         return owners
 
+    @property
+    def tissue_parameters(self) -> tuple[str, ...]:
+        """Names of the parameters of the law and of its viscosity."""
+        of_viscosity = () if self.viscosity is None else self.viscosity.quantities
+        return (*self.law.parameters, *(quantity.name for quantity in of_viscosity))
+
     @cached_property
     def histories(self) -> Histories:
         """The points of the tests through time, of a specimen with viscosity."""
@@ -187,7 +193,7 @@ class Specimen(ForwardProblem):
         return histories(self.states.protocols, self.times, size)
 
     def read_table(self, path: Path) -> Cells:
-        """Return a table's rows; with viscosity those of unloading, too, at the specimen's times."""
+        """Return a table's rows, with viscosity those of unloading, too; refuse other times."""
         if self.viscosity is None:
             return super().read_table(path)
         cells = read_cells(path, unloading=True)

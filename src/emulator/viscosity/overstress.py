@@ -49,7 +49,7 @@ def at_rest(series: Series) -> Memory:
 
 
 def _decay(series: Series, interval: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return what is left of each overstress after an interval, and of stress added evenly, (a,)."""
+    """Return what is left of overstress after an interval, and of stress added evenly, (a,)."""
     x = interval / series.times
     small = x < 1e-9
     safe = jnp.where(small, 1.0, x)  # else the unused branch has the derivative of 0/0
@@ -65,7 +65,7 @@ def step_after(memory: Memory, series: Series, interval: jax.Array) -> Step:
 
 
 def memory_after(memory: Memory, series: Series, interval: jax.Array, stress: jax.Array) -> Memory:
-    """Return the memory after a step of ``interval`` s to the isochoric ``stress`` (3, 3) in kPa."""
+    """Return the memory after a step of ``interval`` s to the isochoric ``stress`` in kPa."""
     left, even = _decay(series, interval)
     added = (even * series.fractions)[:, None, None] * (stress - memory.stress)
     return Memory(left[:, None, None] * memory.overstress + added, stress)
@@ -131,7 +131,7 @@ class Histories(NamedTuple):
     positions: np.ndarray
 
     def along(self, series: Series, advance: Callable[..., Any], inputs: Any) -> Any:
-        """Return the outcomes of ``advance`` at all states, (m, ...), by a scan over time at each point.
+        """Return the outcomes of ``advance`` at all states, (m, ...), by a scan over time.
 
         advance : the function of memory, interval and a state's inputs that returns the memory
             after the state, and its outcome.

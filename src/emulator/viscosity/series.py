@@ -20,7 +20,7 @@ equal ratios of times between ``tau_1`` and ``tau_2``, with the strength c, ``sp
     L = \ln (\tau_2 / \tau_1), \qquad E_1(x) = \int_x^\infty \frac{e^{-s}}{s}\, ds .
 
 Gauss-Legendre points in :math:`\ln \tau` make it a series of 16 terms, or of ``terms``. The largest
-error of G is 4e-4 of :math:`c L / (1 + c L)` where the times are five decades apart, 3e-6 for three
+error of G is 3e-5 of :math:`c L / (1 + c L)` where the times are five decades apart, 2e-7 for three
 decades (``tests/emulator/viscosity/test_series.py``).
 """
 
