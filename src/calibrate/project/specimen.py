@@ -14,7 +14,7 @@ from calibrate.measurements.stress import is_stress
 from calibrate.measurements.stretch import Stretch
 from calibrate.measurements.tube import TubeForce, TubePressure
 from calibrate.project.viscosity import ViscosityDraft, draft_viscosity
-from emulator.core.cells import BRANCH, PROTOCOL, Cells, read_cells, without_unloading
+from emulator.core.cells import BRANCH, PROTOCOL, Cells, read_cells
 from emulator.core.errors import InputError
 from emulator.core.units import KPA_PER_MMHG, with_unit
 from emulator.mechanics.laws import Law, find_law
@@ -106,25 +106,23 @@ def draft_specimen(
             raise InputError(f"{path} is there already; remove it or give --out another name")
     if not table.is_file():
         raise InputError(f"data file {table} does not exist")
-    cells = read_cells(table, unloading=True)
-    viscosity, without = draft_viscosity(cells, tube)
-    cells = without_unloading(cells) if viscosity is None else cells
-    states = read_states(cells, tube, timed=viscosity is not None)
+    cells, viscosity = draft_viscosity(read_cells(table, unloading=True), tube)
+    states = read_states(cells, tube, timed=not isinstance(viscosity, str))
     measured, slope = _size(cells, states, tube)
     motion = (np.diagonal(states.gradients, axis1=1, axis2=2) != 0.0) | (states.pulls != 0.0)
     axes = [axis for axis, column in zip(AXES, motion.T, strict=True) if column.any()]
     chosen = "holzapfel_gasser_ogden" if len(axes) > 1 else "holzapfel_ogden_isotropic"
     material = find_law(law or chosen)
     of_law = f"law {material.name}" + ("" if law else ": a guess, give --law NAME")
-    notes = _notes(cells, of_law, measured, slope, tube, viscosity or without)
-    source, folder = table.resolve(), scene_path.resolve().parent
-    name = source.relative_to(folder) if source.is_relative_to(folder) else source
+    notes = _notes(cells, of_law, measured, slope, tube, viscosity)
+    name, folder = table.resolve(), scene_path.resolve().parent
+    name = name.relative_to(folder) if name.is_relative_to(folder) else name
     scene_path.parent.mkdir(parents=True, exist_ok=True)
-    grips = viscosity is None and tube is None and not states.pulls.any()
+    grips = isinstance(viscosity, str) and tube is None and not states.pulls.any()
     published = published_exponents(material, tissue)
     text = _scene_text(material, name.as_posix(), axes, slope, published, tube, grips=grips)
-    extra = ("", *_GRIPS) if grips else () if viscosity is None else viscosity.lines
-    text += "\n".join([*extra, ""]) if extra else ""
+    extra = ("", *_GRIPS) * grips if isinstance(viscosity, str) else viscosity.lines
+    text += "".join(f"{line}\n" for line in extra)
     scene_path.write_text(text, encoding="utf-8")
     try:
         scene = require_specimen(read_scene(scene_path))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emulator.core.cells import Cells
+from emulator.core.cells import Cells, without_unloading
 from emulator.core.errors import InputError
 from emulator.scenes.draft import prior_lines
 from emulator.specimens.specimen import read_states
@@ -34,13 +34,15 @@ class ViscosityDraft(NamedTuple):
     lines: tuple[str, ...]
 
 
-def draft_viscosity(cells: Cells, tube: Tube | None) -> tuple[ViscosityDraft | None, str]:
-    """Return the viscosity proposed for a table with all its rows, or None and why there is none.
+def draft_viscosity(cells: Cells, tube: Tube | None) -> tuple[Cells, ViscosityDraft | str]:
+    """Return the rows of a table that are data, and the viscosity proposed for it.
 
-    The text is empty for a table without times.
+    In its place a text says why there is none; it is empty for a table without times.
+
+    cells : all rows, those of unloading included.
     """
     if time_column(cells) is None:
-        return None, ""
+        return without_unloading(cells), ""
     try:
         times = read_times(cells)
         states = read_states(cells, tube, timed=True)
@@ -48,18 +50,20 @@ def draft_viscosity(cells: Cells, tube: Tube | None) -> tuple[ViscosityDraft | N
         tests = {name: rows[::size] // size for name, rows in states.protocols.items()}
         check_times(times, tests, len(times))
     except InputError as error:
-        return None, f"{TIME} is left out, its tests are taken to be elastic: {error}"
+        return without_unloading(
+            cells
+        ), f"{TIME} is left out, its tests are taken to be elastic: {error}"
     reasons = tuple(_reasons(states, times, tests, size, list(cells.rows)))
     if not reasons:
         text = "no hold, no return and one rate, so that the table does not tell how it relaxes"
-        return None, f"{TIME} is left out: {text}"
+        return without_unloading(cells), f"{TIME} is left out: {text}"
     steps = np.concatenate([np.diff(times[rows]) for rows in tests.values()])
     fast = float(np.median(steps[steps > 0.0]))
     slow = max(float(np.ptp(times[rows])) for rows in tests.values())
     held = any("hold" in reason for reason in reasons)
     viscosity = Viscosity(terms=2 if held and slow > 10.0**_DECADES * fast else 1)
     lines = tuple(_lines(viscosity, fast, slow))
-    return ViscosityDraft(viscosity, times, reasons, lines), ""
+    return cells, ViscosityDraft(viscosity, times, reasons, lines)
 
 
 def _reasons(

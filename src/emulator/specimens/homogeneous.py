@@ -42,7 +42,7 @@ from emulator.specimens.specimen import Specimen, require_specimen
 from emulator.surrogates.protocol import ForwardKind, Prediction, fingerprint_of
 from emulator.viscosity.overstress import (
     Memory,
-    Step,
+    TimeStep,
     isochoric_stress,
     linearised,
     memory_after,
@@ -262,7 +262,7 @@ class Point(NamedTuple):
     moduli: Callable[..., tuple[jax.Array, jax.Array]]
 
 
-def _of_step(point: Point, step: Step, *, incompressible: bool) -> Point:
+def _of_step(point: Point, step: TimeStep, *, incompressible: bool) -> Point:
     """Return the potential of a step with viscosity in the place of the law's energy."""
     energy = potential(point.energy, step, incompressible=incompressible)
     if incompressible:

@@ -32,7 +32,7 @@ class Memory(NamedTuple):
     stress: jax.Array
 
 
-class Step(NamedTuple):
+class TimeStep(NamedTuple):
     """The potential of a time step, :math:`W_vol + s W_iso + A : E`.
 
     scale : the factor s of the isochoric energy, ().
@@ -56,12 +56,14 @@ def _decay(series: Series, interval: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.exp(-x), jnp.where(small, 1.0 - 0.5 * x, -jnp.expm1(-safe) / safe)
 
 
-def step_after(memory: Memory, series: Series, interval: jax.Array) -> Step:
+def step_after(memory: Memory, series: Series, interval: jax.Array) -> TimeStep:
     """Return the potential of a step of ``interval`` s; 0 is an instant one."""
     left, even = _decay(series, interval)
     added = even * series.fractions
     scale = 1.0 - jnp.sum(series.fractions) + jnp.sum(added)
-    return Step(scale, jnp.tensordot(left, memory.overstress, 1) - jnp.sum(added) * memory.stress)
+    return TimeStep(
+        scale, jnp.tensordot(left, memory.overstress, 1) - jnp.sum(added) * memory.stress
+    )
 
 
 def memory_after(memory: Memory, series: Series, interval: jax.Array, stress: jax.Array) -> Memory:
@@ -91,7 +93,7 @@ def isochoric_stress(energy: Energy, H: jax.Array, *tissue: Any) -> jax.Array:
     return jnp.exp(-2.0 / 3.0 * Strain(H).ln_J) * G.T @ (P - jnp.vdot(P, F) / 3.0 * G)
 
 
-def potential(energy: Energy, step: Step, *, incompressible: bool = False) -> Energy:
+def potential(energy: Energy, step: TimeStep, *, incompressible: bool = False) -> Energy:
     """Return the potential of a step in kPa, as a function of what ``energy`` reads.
 
     incompressible : whether J is 1 wherever it is evaluated, so that the whole law is isochoric.
@@ -107,7 +109,7 @@ def potential(energy: Energy, step: Step, *, incompressible: bool = False) -> En
     return value
 
 
-def linearised(moduli: Callable[..., Any], step: Step, H: jax.Array, *tissue: Any) -> Any:
+def linearised(moduli: Callable[..., Any], step: TimeStep, H: jax.Array, *tissue: Any) -> Any:
     """Return stress (3, 3) and moduli (3, 3, 3, 3) in kPa of the potential where J is 1.
 
     moduli : the function that returns those of the law.
@@ -146,10 +148,12 @@ class Histories(NamedTuple):
         outcomes = jax.vmap(of_point)(jnp.asarray(self.intervals), by_time)
         return jax.tree.map(lambda values: values[tuple(self.positions)], outcomes)
 
-    def steps(self, series: Series, stresses: jax.Array) -> Step:
+    def steps(self, series: Series, stresses: jax.Array) -> TimeStep:
         """Return the steps that lead to all states, (m, ...), from their isochoric stresses."""
 
-        def advance(memory: Memory, interval: jax.Array, stress: jax.Array) -> tuple[Memory, Step]:
+        def advance(
+            memory: Memory, interval: jax.Array, stress: jax.Array
+        ) -> tuple[Memory, TimeStep]:
             step = step_after(memory, series, interval)
             return memory_after(memory, series, interval, stress), step
 

@@ -116,7 +116,7 @@ range = [0.1, 100.0]
         ),
         (("[viscosity]\n", "[viscosity]\nterms = 9\n"), "9 terms of kind 'prony'; give 1 to 6"),
         (("[viscosity]\n", '[viscosity]\nkind = "kelvin"\n'), "kind"),
-        (("[viscosity]\n", ""), "parameter 'relaxation_1' is not one of law"),
+        (("[viscosity]\n", ""), "row 11 of 'one' is nearer to rest than one before"),
     ],
 )
 def test_what_a_file_cannot_say_is_refused_in_one_line(tmp_path, words, message):
