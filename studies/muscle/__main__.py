@@ -60,28 +60,20 @@ def fit(curves: list[Curve], model: str, quick: bool) -> Case:
     }
 
 
-def band(model: str, case: Case, curve: Curve) -> dict[str, list[float]]:
-    """90 % bands (k,) of Cauchy stress in kPa: of what is measured, errors included, and the law.
+def bands(model: str, case: Case, curves: list[Curve]) -> list[dict[str, list[float]]]:
+    """90 % bands (k,) of each curve in kPa: of what is measured, errors included, and of the law.
 
     Both kinds of errors are drawn at each point, which is all that a band of points needs.
     """
-    predicted = stresses(model, np.array(case["thetas"]), curve)
-    rng = np.random.default_rng(SEED)
-    errors = np.linalg.norm(case["sds"], axis=1)[:, None] * rng.normal(size=predicted.shape)
-    low, high = np.quantile(predicted + errors, [0.05, 0.95], axis=0)
-    of_law = np.quantile(predicted, [0.05, 0.5, 0.95], axis=0)
     names = ("low", "high", "law_low", "median", "law_high")
-    return {n: np.round(v, 4).tolist() for n, v in zip(names, (low, high, *of_law), strict=True)}
-
-
-def predicted(case: Case, model: str, direction: str) -> Case:
-    """The bands of a direction pressed faster than it ever was."""
-    curve = pressed(direction, *FASTER)
-    return {
-        "time": curve.time.tolist(),
-        "stretch": curve.stretch.tolist(),
-        **band(model, case, curve),
-    }
+    result, rng = [], np.random.default_rng(SEED)
+    for predicted in stresses(model, np.array(case["thetas"]), curves):
+        errors = np.linalg.norm(case["sds"], axis=1)[:, None] * rng.normal(size=predicted.shape)
+        ends = np.quantile(predicted + errors, [0.05, 0.95], axis=0)
+        of_law = np.quantile(predicted, [0.05, 0.5, 0.95], axis=0)
+        values = zip(names, (*ends, *of_law), strict=True)
+        result.append({name: np.round(value, 4).tolist() for name, value in values})
+    return result
 
 
 def likeliest(cases: dict[str, Case], direction: str) -> str:
@@ -92,46 +84,54 @@ def likeliest(cases: dict[str, Case], direction: str) -> str:
 
 def judge(folder: Path, cases: dict[str, Case]) -> None:
     """Print how many points of each curve lie in the band of the likeliest law."""
-    for curve in read(folder):
-        model = likeliest(cases, curve.direction)
-        at = band(model, cases[f"{curve.direction} {model}"], curve)
-        low, high = np.array(at["low"]), np.array(at["high"])
-        inside = (low <= curve.stress) & (curve.stress <= high)
-        peak = int(np.argmin(curve.stress))
-        print(
-            f"{curve.name}: {inside.sum()} of {len(inside)} points inside of the 90 % band of "
-            f"{WORDS.get(model, model)}; at the largest stress {curve.stress[peak]:.3f} kPa, band "
-            f"{low[peak]:.3f} to {high[peak]:.3f}, at the end {curve.stress[-1]:.3f}, band "
-            f"{low[-1]:.3f} to {high[-1]:.3f}"
-        )
+    for direction in DIRECTIONS:
+        curves = [curve for curve in read(folder) if curve.direction == direction]
+        model = likeliest(cases, direction)
+        predicted = bands(model, cases[f"{direction} {model}"], curves) if curves else []
+        for curve, band in zip(curves, predicted, strict=True):
+            low, high = np.array(band["low"]), np.array(band["high"])
+            inside = (low <= curve.stress) & (curve.stress <= high)
+            peak = int(np.argmin(curve.stress))
+            print(
+                f"{curve.name}: {inside.sum()} of {len(inside)} points inside of the 90 % band of "
+                f"{WORDS.get(model, model)}; at the largest stress {curve.stress[peak]:.3f} kPa, "
+                f"band {low[peak]:.3f} to {high[peak]:.3f}, at the end {curve.stress[-1]:.3f}, "
+                f"band {low[-1]:.3f} to {high[-1]:.3f}"
+            )
 
 
-def draw(cases: dict[str, Case], curves: list[Curve], path: Path) -> None:
-    """Draw data and the likeliest law's bands, and the prediction, over time."""
+def draw(cases: dict[str, Case], curves: list[Curve], path: Path) -> Case:
+    """Draw data, the likeliest law's bands and the elastic law; return the bands of the faster."""
     figure, axes = pyplot().subplots(2, 4, figsize=(12.0, 5.5), layout="constrained", sharex="col")
+    faster: Case = {}
     for row, direction in zip(axes, DIRECTIONS, strict=True):
         if not any(name.startswith(f"{direction} ") for name in cases):
             continue
-        model = likeliest(cases, direction)
-        case, elastic = cases[f"{direction} {model}"], cases.get(f"{direction} elastic")
-        shown = [curve for curve in curves if curve.direction == direction]
-        for axis, curve in zip(row, [*shown, pressed(direction, *FASTER)], strict=True):
-            at = band(model, case, curve)
-            axis.fill_between(curve.time, at["low"], at["high"], color=BLUE, alpha=0.2, lw=0)
-            axis.plot(curve.time, at["median"], color=BLUE, label=WORDS.get(model, model))
-            if elastic is not None:
-                median = band("elastic", elastic, curve)["median"]
-                axis.plot(curve.time, median, color=ORANGE, lw=1, label="elastic")
+        model, unseen = likeliest(cases, direction), pressed(direction, *FASTER)
+        shown = [*(curve for curve in curves if curve.direction == direction), unseen]
+        predicted = bands(model, cases[f"{direction} {model}"], shown)
+        elastic = cases.get(f"{direction} elastic")
+        without = bands("elastic", elastic, shown) if elastic is not None else predicted
+        for axis, curve, band, other in zip(row, shown, predicted, without, strict=True):
+            axis.fill_between(curve.time, band["low"], band["high"], color=BLUE, alpha=0.2, lw=0)
+            axis.plot(curve.time, other["median"], color=ORANGE, lw=1, label="elastic")
+            axis.plot(curve.time, band["median"], color=BLUE, label=WORDS.get(model, model))
             axis.plot(curve.time, curve.stress, "k.", ms=3)
-            unseen = " (not seen)" if np.isnan(curve.stress).all() else ""
-            words = f"{direction}, {curve.percent:g} % at {curve.rate:g} %/s{unseen}"
-            axis.set_title(words, fontsize=9)
+            title = f"{direction}, {curve.percent:g} % at {curve.rate:g} %/s"
+            axis.set_title(title + " (not seen)" * (curve is unseen), fontsize=9)
             axis.spines[["top", "right"]].set_visible(False)
+        faster[direction] = {
+            "model": model,
+            "time": unseen.time.tolist(),
+            "stretch": unseen.stretch.tolist(),
+            **predicted[-1],
+        }
         row[0].set_ylabel("Cauchy stress, kPa")
         row[0].legend(frameon=False, fontsize=8)
     for axis in axes[1]:
         axis.set_xlabel("time, s")
     save(figure, path)
+    return faster
 
 
 def conclude(cases: dict[str, Case]) -> Case:
@@ -159,7 +159,9 @@ def main() -> None:
     arguments = words.parse_args()
     if arguments.judge is not None:
         there = json.loads((arguments.out / "results.json").read_text())
-        judge(arguments.judge, {case["name"]: case for case in there["cases"]})
+        of_all = arguments.judge / "muscle"
+        folder = of_all if of_all.is_dir() else arguments.judge
+        judge(folder, {case["name"]: case for case in there["cases"]})
         return
     if arguments.data is None:
         raise em.InputError("give --data DIR, the folder of the curves")
@@ -175,17 +177,9 @@ def main() -> None:
                 if re.match(arguments.only, name):
                     results.case(name, partial(fit, some, model, quick))
     cases = {case["name"]: case for case in results.cases}
-    bands = {}
-    for direction in DIRECTIONS:
-        if any(name.startswith(f"{direction} ") for name in cases):
-            model = likeliest(cases, direction)
-            bands[direction] = {
-                "model": model,
-                **predicted(cases[f"{direction} {model}"], model, direction),
-            }
     summary = conclude(cases)
-    results.write(summary=summary, bands=bands)
-    draw(cases, curves, arguments.out / "muscle.png")
+    faster = draw(cases, curves, arguments.out / "muscle.png")
+    results.write(summary=summary, bands=faster)
     print(json.dumps(summary, indent=2))
 
 

@@ -123,10 +123,11 @@ def posterior_of(model: str, curves: Sequence[Curve], seed: int, quick: bool) ->
     return cal.sample(statistical, data, sampler="importance", options=options, seed=seed)
 
 
-def stresses(model: str, thetas: np.ndarray, curve: Curve) -> np.ndarray:
-    """Cauchy stresses (s, k) in kPa along a curve, at ``thetas`` (s, p)."""
-    scene = scene_of(model, [curve])
+def stresses(model: str, thetas: np.ndarray, curves: Sequence[Curve]) -> list[np.ndarray]:
+    """Cauchy stresses (s, k) in kPa along each curve, at ``thetas`` (s, p)."""
+    scene = scene_of(model, curves)
     forward, observe = em.homogeneous(scene, incompressible=True), cal.stresses(scene, "cauchy_x")
     one = lambda theta: observe(forward(theta), theta)[:, 0]  # noqa: E731
     program = jax.jit(lambda thetas: jax.lax.map(one, thetas, batch_size=50))
-    return np.asarray(program(jnp.asarray(thetas)))
+    ends = np.cumsum([len(curve.time) for curve in curves])[:-1]
+    return np.split(np.asarray(program(jnp.asarray(thetas))), ends, axis=1)

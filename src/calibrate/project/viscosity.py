@@ -52,11 +52,11 @@ def draft_viscosity(cells: Cells, tube: Tube | None) -> tuple[Cells, ViscosityDr
     except InputError as error:
         return without_unloading(
             cells
-        ), f"{TIME} is left out, its tests are taken to be elastic: {error}"
+        ), f"no [viscosity], its times cannot be read: {error}"
     reasons = tuple(_reasons(states, times, tests, size, list(cells.rows)))
     if not reasons:
         text = "no hold, no return and one rate, so that the table does not tell how it relaxes"
-        return without_unloading(cells), f"{TIME} is left out: {text}"
+        return without_unloading(cells), f"no [viscosity]: {text}"
     steps = np.concatenate([np.diff(times[rows]) for rows in tests.values()])
     fast = float(np.median(steps[steps > 0.0]))
     slow = max(float(np.ptp(times[rows])) for rows in tests.values())

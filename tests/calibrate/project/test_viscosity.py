@@ -72,7 +72,7 @@ def test_times_may_be_in_minutes_and_rates_of_two_tests_differ(tmp_path):
 def test_a_table_whose_times_say_nothing_is_elastic_as_ever(tmp_path, text, note):
     draft = drafted(tmp_path, text)
     (said,) = (line for line in draft.notes if note in line)
-    assert said.startswith("time is left out")
+    assert said.startswith("no [viscosity]")
     assert any("columns left out: time" in line for line in draft.notes)
     assert draft.scene.viscosity is None
     assert "viscosity" not in draft.scene_path.read_text()
