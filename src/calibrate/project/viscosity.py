@@ -50,9 +50,7 @@ def draft_viscosity(cells: Cells, tube: Tube | None) -> tuple[Cells, ViscosityDr
         tests = {name: rows[::size] // size for name, rows in states.protocols.items()}
         check_times(times, tests, len(times))
     except InputError as error:
-        return without_unloading(
-            cells
-        ), f"no [viscosity], its times cannot be read: {error}"
+        return without_unloading(cells), f"no [viscosity], its times cannot be read: {error}"
     reasons = tuple(_reasons(states, times, tests, size, list(cells.rows)))
     if not reasons:
         text = "no hold, no return and one rate, so that the table does not tell how it relaxes"

@@ -198,7 +198,8 @@ class Specimen(ForwardProblem):
             return super().read_table(path)
         cells = read_cells(path, unloading=True)
         times = read_times(cells)
-        if times.shape != np.shape(self.times) or np.abs(times - self.times).max() > _ROUND_OFF:
+        assert self.times is not None  # of a specimen with viscosity
+        if times.shape != self.times.shape or np.abs(times - self.times).max() > _ROUND_OFF:
             raise InputError(f"data file {path}: times are not those of scene '{self.name}'")
         return cells
 
