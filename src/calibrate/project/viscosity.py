@@ -14,7 +14,7 @@ from emulator.specimens.specimen import read_states
 from emulator.specimens.states import States, falls
 from emulator.specimens.tube import Tube
 from emulator.viscosity.series import Viscosity
-from emulator.viscosity.times import TIME, check_times, read_times, time_column
+from emulator.viscosity.times import check_times, read_times, time_column
 
 _RATES = 1.5  # ratio of the mean rates of two tests that are two
 _DECADES = 1.5  # of times that a hold has for a second term
