@@ -28,6 +28,7 @@ ROOMS = {
         "calibrate.statistical_model.gripped_fem",
         "calibrate.project.specimen",
     ),
+    "viscosity": ("emulator.viscosity", "calibrate.project.viscosity"),
     "fields": (
         "calibrate.measurements.frame_checks",
         "calibrate.fields",
@@ -65,6 +66,8 @@ NEIGHBOURS = {
     "fields": {"hearts", "specimens"},
     "pages": {"analyses", "populations", "serving", "specimens"},
     "released": {"specimens"},
+    "specimens": {"viscosity"},
+    "viscosity": {"specimens"},
     "serving": {"pages"},
     "populations": {"pages", "specimens"},
     "predictions": {"pages", "populations", "specimens"},

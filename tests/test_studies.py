@@ -35,6 +35,7 @@ QUICK = {
     "living_skin": "--data MEASURED/living_skin --quick",
     "mesh_row": "--quick",
     "mesh_to_certificate": "--quick",
+    "muscle": "--data MEASURED/muscle --quick",
     "networks_alone": "--quick",
     "no_box": "--quick",
     "released_networks": "--quick --published PUBLISHED",

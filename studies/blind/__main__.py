@@ -40,6 +40,7 @@ JUDGES = {
     "living_skin": "living_skin",
     "human_heart": "human_heart",
     "human_myocardium": "myocardium_tables",
+    "muscle": "muscle",
 }
 
 

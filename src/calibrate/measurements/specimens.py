@@ -20,6 +20,7 @@ from emulator.core.errors import InputError
 from emulator.scenes.scene import all_nodes
 from emulator.specimens.specimen import Specimen, require_specimen, states_in
 from emulator.specimens.states import APPLIED, AXES, States
+from emulator.viscosity.times import TIME
 
 _APART = 1e3  # distance between the points of two tests, whose errors do not correlate
 _ROUND_OFF = 1e-6
@@ -41,13 +42,16 @@ class SpecimenCurves(PointObservation):
     scene : the specimen; :class:`InputError` for a scene.
     states : the measured states.
     points : the arc length of each state from the first of its test, and the test's position, so
-        that errors correlate along a curve.
+        that errors correlate along a curve. With viscosity, a test's time adds, as a share of its
+        whole time.
+    along : the x axis of :meth:`curves`, (d,): the arc length, or the time in s.
     stretches : the prescribed stretches of the states along x, y and z, (d, 3); NaN where free.
     """
 
     scene: Specimen
     states: States
     stretches: np.ndarray
+    along: np.ndarray
 
     place = ""
     row = "state"
@@ -58,14 +62,20 @@ class SpecimenCurves(PointObservation):
 
     def __post_init__(self) -> None:
         states = require_specimen(self.scene).measured
-        points = np.zeros((len(states.free), 3))
-        points[:, 0] = states.paths
+        points, times = np.zeros((len(states.free), 3)), self.scene.times
+        points[:, 0] = along = states.paths
         for number, rows in enumerate(states.protocols.values()):
             points[rows, 1] = _APART * number
+            if times is not None:
+                points[rows, 0] += (times[rows] - times[rows[0]]) / (np.ptp(times[rows]) or 1.0)
+        if times is not None:
+            along = times
+            derive(self, curve_axis="time in s")
         diagonals = np.diagonal(states.gradients, axis1=1, axis2=2)
         stretches = np.where(states.free, np.nan, 1.0 + diagonals)
         nodes = all_nodes(self.scene)
-        derive(self, nodes=nodes, states=states, points=points, stretches=stretches)
+        derive(self, nodes=nodes, states=states, points=points)
+        derive(self, stretches=stretches, along=along)
 
     @abstractmethod
     def _measured(self, u: jax.Array, theta: jax.Array) -> jax.Array:
@@ -105,7 +115,7 @@ class SpecimenCurves(PointObservation):
             for c, name in enumerate(self.components or (self.name,)):
                 points = rows[components[rows] == c]
                 if len(points):
-                    curves[f"{test} {name}".strip()] = self.points[states[points], 0], points
+                    curves[f"{test} {name}".strip()] = self.along[states[points]], points
         return curves
 
     def _states_and_components(self, entries: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
@@ -160,6 +170,7 @@ class SpecimenCurves(PointObservation):
             pulls = np.where(self.states.free, self.states.pulls, np.nan)
             arrays |= {f"{APPLIED}_{a}": pulls[:, k] for k, a in enumerate(AXES)}
         kept = {w: x for w, x in arrays.items() if w in self._pulls or np.nan_to_num(x).any()}
+        kept |= {} if self.scene.times is None else {TIME: self.scene.times}
         return [(DataField(word, (word,), where=True), x) for word, x in kept.items()]
 
     @property
@@ -233,7 +244,9 @@ def check_tests(observed: Mapping[str, tuple[Any, np.ndarray]]) -> None:
         return
     states = curves[0][0].states
     numbers = np.hstack([part.comparable(y.reshape(len(y), -1)) for part, y in curves])
-    motion = np.hstack([a.reshape(len(numbers), -1) for a in (states.gradients, states.pulls)])
+    times = curves[0][0].scene.times
+    arrays = (states.gradients, states.pulls, *([] if times is None else [times]))
+    motion = np.hstack([a.reshape(len(numbers), -1) for a in arrays])
     # In units of what two readings of one measurement may differ by.
     motion, numbers = _in_shares(motion, _ROUND_OFF), _in_shares(numbers, _ALIKE)
     known = np.isfinite(numbers)

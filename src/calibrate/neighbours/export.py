@@ -68,8 +68,8 @@ def export_posterior(
     ------
     InputError
         An unknown program or one without the law, a run that does not exist or has no law, more
-        draws than the posterior has, a folder that exists, regions of different stiffness, or a
-        mesh asked of a specimen.
+        draws than the posterior has, a folder that exists, regions of different stiffness,
+        viscosity, or a mesh asked of a specimen.
     """
     target, out = look_up(PROGRAMS, program, "program"), Path(out)
     if out.exists():
@@ -82,6 +82,8 @@ def export_posterior(
     law = problem.law
     form_of(target, law)  # refuses before the longer work
     _refuse_regions(problem)
+    if len(problem.tissue_parameters) > len(law.parameters):
+        raise InputError(f"scene '{problem.name}' has viscosity; cards are of elastic laws")
     body = body_of(with_mesh(problem), _mean_theta(posterior)) if mesh else None
     table = _parameters(posterior, law)
     count = len(next(iter(table.values())))

@@ -122,18 +122,20 @@ def made_of[P: ForwardProblem](scene: P, tissue: ForwardProblem) -> P:
 
     :class:`InputError` where the law needs fibres or sheets and the scene has none.
     """
-    law, before = tissue.law, set(scene.law.parameters)
-    gone = before - ({_BULK} & set(law.parameters))
-    constants = {name: v for name, v in tissue.constants.items() if name in law.parameters}
+    law, before, after = tissue.law, set(scene.tissue_parameters), set(tissue.tissue_parameters)
+    gone = before - ({_BULK} & after)
+    constants = {name: v for name, v in tissue.constants.items() if name in after}
     constants |= {name: v for name, v in scene.constants.items() if name not in gone}
     parameters = (
-        *(p for p in tissue.parameters if p.name in law.parameters and p.name not in constants),
+        *(p for p in tissue.parameters if p.name in after and p.name not in constants),
         *(p for p in scene.parameters if p.name not in before),
     )
     read = directions_read(law, getattr(scene, "loads", ()))
     changes: dict[str, Any] = {
         kind: None if reader is None else getattr(scene, kind) for kind, reader in read.items()
     }
+    if hasattr(scene, "viscosity"):
+        changes["viscosity"] = getattr(tissue, "viscosity", None)
     changes["angles"] = effective_angles(scene.angles, changes["fibres"], changes["sheets"])
     other = replace(
         cast(Any, scene), law=law, parameters=parameters, constants=constants, origin={}, **changes
@@ -163,7 +165,12 @@ def transfer(
             f"scene '{scene.name}' has law {scene.law.name}, and the posterior is of "
             f"{before.law.name}: give a scene of the same law"
         )
-    material = [name for name in before.parameter_names if name in before.law.parameters]
+    if other := set(before.tissue_parameters) ^ set(scene.tissue_parameters):
+        raise InputError(
+            f"scene '{scene.name}' or the posterior has no {', '.join(sorted(other))}: give a "
+            "scene with the posterior's [viscosity]"
+        )
+    material = [name for name in before.parameter_names if name in before.tissue_parameters]
     for name in material:
         if name in inferred and name in scene.constants:
             raise InputError(
@@ -174,7 +181,7 @@ def transfer(
             raise InputError(f"{name} is known as {known[name]:g}, and the posterior infers it")
     sources = dict.fromkeys(known, "given")
     fixed, values = learned.known, dict(known)
-    for name in set(scene.parameter_names) & set(scene.law.parameters) - set(inferred):
+    for name in set(scene.parameter_names) & set(scene.tissue_parameters) - set(inferred):
         if name in fixed and name not in values:
             values[name], sources[name] = fixed[name], f"{fixed[name]:g}, as for the posterior"
     size = len(next(iter(inferred.values())))

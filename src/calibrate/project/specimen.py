@@ -13,6 +13,7 @@ from calibrate.measurements.specimens import SpecimenCurves
 from calibrate.measurements.stress import is_stress
 from calibrate.measurements.stretch import Stretch
 from calibrate.measurements.tube import TubeForce, TubePressure
+from calibrate.project.viscosity import ViscosityDraft, draft_viscosity
 from emulator.core.cells import BRANCH, PROTOCOL, Cells, read_cells
 from emulator.core.errors import InputError
 from emulator.core.units import KPA_PER_MMHG, with_unit
@@ -33,6 +34,7 @@ from emulator.specimens.specimen import (
 from emulator.specimens.states import AXES, States, motion_columns, pull_columns
 from emulator.specimens.tube import Tube
 from emulator.specimens.tube import motion_columns as tube_columns
+from emulator.viscosity.times import TIME
 
 _MODULI = (0.005, 3.0)  # range of a modulus, as a share of the largest stress over its strain
 _EXPONENTS = (0.1, 50.0)
@@ -104,23 +106,23 @@ def draft_specimen(
             raise InputError(f"{path} is there already; remove it or give --out another name")
     if not table.is_file():
         raise InputError(f"data file {table} does not exist")
-    cells = read_cells(table)
-    states = read_states(cells, tube)
+    cells, viscosity = draft_viscosity(read_cells(table, unloading=True), tube)
+    states = read_states(cells, tube, timed=not isinstance(viscosity, str))
     measured, slope = _size(cells, states, tube)
     motion = (np.diagonal(states.gradients, axis1=1, axis2=2) != 0.0) | (states.pulls != 0.0)
     axes = [axis for axis, column in zip(AXES, motion.T, strict=True) if column.any()]
     chosen = "holzapfel_gasser_ogden" if len(axes) > 1 else "holzapfel_ogden_isotropic"
     material = find_law(law or chosen)
     of_law = f"law {material.name}" + ("" if law else ": a guess, give --law NAME")
-    notes = _notes(cells, of_law, measured, slope, tube)
-    source, folder = table.resolve(), scene_path.resolve().parent
-    name = source.relative_to(folder) if source.is_relative_to(folder) else source
+    notes = _notes(cells, of_law, measured, slope, tube, viscosity)
+    name, folder = table.resolve(), scene_path.resolve().parent
+    name = name.relative_to(folder) if name.is_relative_to(folder) else name
     scene_path.parent.mkdir(parents=True, exist_ok=True)
-    pulled = bool(states.pulls.any())
+    grips = isinstance(viscosity, str) and tube is None and not states.pulls.any()
     published = published_exponents(material, tissue)
-    text = _scene_text(material, name.as_posix(), axes, slope, published, tube, pulled=pulled)
-    if tube is None and not pulled:
-        text += "\n".join(["", *_GRIPS, ""])
+    text = _scene_text(material, name.as_posix(), axes, slope, published, tube, grips=grips)
+    extra = ("", *_GRIPS) * grips if isinstance(viscosity, str) else viscosity.lines
+    text += "".join(f"{line}\n" for line in extra)
     scene_path.write_text(text, encoding="utf-8")
     try:
         scene = require_specimen(read_scene(scene_path))
@@ -132,7 +134,12 @@ def draft_specimen(
 
 
 def _notes(
-    cells: Cells, of_law: str, measured: _Sizes, slope: float, tube: Tube | None
+    cells: Cells,
+    of_law: str,
+    measured: _Sizes,
+    slope: float,
+    tube: Tube | None,
+    viscosity: ViscosityDraft | str,
 ) -> list[str]:
     """Return one sentence per value that was read or guessed; ``of_law`` is the one on the law."""
     part, _ = next(iter(measured.values()))
@@ -152,7 +159,11 @@ def _notes(
             f"{name} reaches {_farthest(data, part.at_rest):.3g} {part.unit}".removesuffix(" 1")
             for name, (part, data) in measured.items()
         ),
-        *_drifts(list(cells.rows), part.states, measured),
+        *(
+            _of_viscosity(viscosity)
+            if isinstance(viscosity, ViscosityDraft)
+            else [*filter(None, [viscosity]), *_drifts(list(cells.rows), part.states, measured)]
+        ),
         *long_table(part.scene),
         of_law,
         f"priors of moduli follow from a stiffness of {slope:.3g} kPa",
@@ -164,11 +175,22 @@ def _notes(
             for name, (part, _) in measured.items()
         ),
     ]
-    notes[1:1] = _of_columns(cells, tube)
+    notes[1:1] = _of_columns(cells, tube, timed=isinstance(viscosity, ViscosityDraft))
     return notes
 
 
-def _of_columns(cells: Cells, tube: Tube | None) -> Iterator[str]:
+def _of_viscosity(draft: ViscosityDraft) -> Iterator[str]:
+    """Say why viscosity is proposed, and what moduli are with it."""
+    few = draft.reasons[:3]
+    more = f", and {len(draft.reasons) - 3} more" if len(draft.reasons) > 3 else ""
+    yield (
+        f"[viscosity] with {draft.viscosity.count} terms, a guess: {'; '.join(few)}{more}; all "
+        "rows are used, in the order of time"
+    )
+    yield "moduli are those of an instant change of shape, before anything relaxes"
+
+
+def _of_columns(cells: Cells, tube: Tube | None, *, timed: bool) -> Iterator[str]:
     """Say which rows and columns are left out, and which have no unit."""
     if cells.unloading:
         yield f"{cells.unloading} rows of unloading are left out"
@@ -177,6 +199,7 @@ def _of_columns(cells: Cells, tube: Tube | None) -> Iterator[str]:
     pulls, of_tube = pull_columns(names).values(), (TubePressure.column, TubeForce.column)
     stresses = [w for w, (n, _) in names.items() if is_stress(w) or w in pulls or n in of_tube]
     used = (*moving, *stresses, PROTOCOL, BRANCH, *(w for w in names if w.startswith("area_")))
+    used += tuple(w for w, (n, _) in names.items() if timed and n == TIME)
     if ignored := [word for word in names if word and word not in used]:
         likely = likely_names(ignored, of_tube=tube is not None)
         yield f"columns left out: {', '.join(ignored)}{likely}"
@@ -289,16 +312,16 @@ def _scene_text(
     published: Mapping[str, LogNormal],
     tube: Tube | None,
     *,
-    pulled: bool,
+    grips: bool,
 ) -> str:
     """Return the scene file. Fibres are along the first axis that moves, sheets across it.
 
     published : the priors of parameters that do not follow from the table.
-    pulled : whether the machine prescribes forces, which grips cannot have.
+    grips : whether there may be any; not of a tube, with prescribed forces or with times.
     """
     lines = [f'law = "{law.name}"   # see docs/laws.md for others', f'specimen = "{table}"']
     if tube is None:
-        lines.append(_NO_GRIPS_PULLED if pulled else _NO_GRIPS)
+        lines.append(_NO_GRIPS if grips else _NO_GRIPS_PULLED)
     if law.fibres:
         first = axes[0] if axes else "x"
         second = next(a for a in [*axes[1:], *AXES] if a != first)

@@ -69,8 +69,10 @@ class Cells(NamedTuple):
             ) from error
 
 
-def read_cells(path: Path) -> Cells:
+def read_cells(path: Path, *, unloading: bool = False) -> Cells:
     """Return the table of a CSV file or a spreadsheet.
+
+    unloading : whether rows of unloading are data; else they are left out.
 
     Raises
     ------
@@ -115,16 +117,22 @@ def read_cells(path: Path) -> Cells:
             rows[number] = dict(zip(words, padded, strict=False))
     if words and not rows:
         raise InputError(f"data file {path}: names of columns, and no row below them")
-    every = len(rows)
-    if BRANCH in words:
-        rows = {k: row for k, row in rows.items() if row[BRANCH].lower() != UNLOADING}
-        if not rows:
-            raise InputError(
-                f"data file {path}: each row is unloading, so that none is left; read a test that "
-                f"was recorded while it unloads from its end: reverse its rows, without '{BRANCH}'"
-            )
     _check_marks(path, rows, decimal_comma=decimal_comma)
-    return Cells(path, words, rows, decimal_comma, every - len(rows))
+    table = Cells(path, words, rows, decimal_comma)
+    return table if unloading else without_unloading(table)
+
+
+def without_unloading(cells: Cells) -> Cells:
+    """Return a table without its rows of unloading; :class:`InputError` if none is left."""
+    if BRANCH not in cells.words:
+        return cells
+    rows = {k: row for k, row in cells.rows.items() if row[BRANCH].lower() != UNLOADING}
+    if not rows:
+        raise InputError(
+            f"data file {cells.path}: each row is unloading, so that none is left; read a test "
+            f"that was recorded while it unloads from its end: reverse its rows, without '{BRANCH}'"
+        )
+    return cells._replace(rows=rows, unloading=len(cells.rows) - len(rows))
 
 
 def _units_of(words: Sequence[str], row: Sequence[str]) -> list[str] | None:

@@ -28,7 +28,9 @@ IN_MM2 = {"mm2": 1.0, "cm2": 100.0, "m2": 1e6}
 """Areas."""
 IN_ML = {"mL": 1.0, "ml": 1.0, "cm3": 1.0, "mm3": 1e-3, "uL": 1e-3, "µL": 1e-3, "L": 1e3, "m3": 1e6}
 """Volumes."""
-UNITS = {*IN_KPA, *IN_MN, *IN_MM, *IN_MM2, *IN_ML, "%", "-", "mm/mm", "s", "min", ""}
+IN_S = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
+"""Times."""
+UNITS = {*IN_KPA, *IN_MN, *IN_MM, *IN_MM2, *IN_ML, *IN_S, "%", "-", "mm/mm", ""}
 """Names that a row of units may have."""
 
 

@@ -65,9 +65,10 @@ def read_scene(path: str | Path) -> ForwardProblem:
     }
     make, of_body = _kind_of(file, source)(path.parent, file, law, source)
     parameters = []
+    limits = (*law.quantities, *getattr(of_body.get("viscosity"), "quantities", ()))
     for name, entry in file.parameters.items():
         with source.at("parameters", name, table=("parameters", name)):
-            parameters.append(_parameter(name, entry, law.quantities))
+            parameters.append(_parameter(name, entry, limits))
     try:
         return make(parameters=tuple(parameters), **entries, **of_body)
     except InputError as error:
@@ -77,7 +78,7 @@ def read_scene(path: str | Path) -> ForwardProblem:
 def _parameter(name: str, entry: ParameterTable, quantities: Iterable[Quantity]) -> Parameter:
     """Return the parameter of a table, which has a range, or a median and a log_sd.
 
-    quantities : those of the law, which limit a median.
+    quantities : those of the law and of viscosity, which limit a median.
     """
     keys = entry.model_fields_set - {"unit"}
     if {"range", "scale"} & keys and {"median", "log_sd", "source"} & keys:
@@ -110,7 +111,7 @@ def _on_mesh(
     """Return the fields of a scene that its body, its loads and its supports give."""
     if not file.supports:
         raise source.error("key 'supports' is missing; expected tables [[supports]]")
-    for table in ("grips", "tube"):
+    for table in ("grips", "tube", "viscosity"):
         if table in source.data:
             problem = f"only a specimen has {table}; give its table as 'specimen'"
             raise source.error(problem, (table,))

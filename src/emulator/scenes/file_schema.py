@@ -96,6 +96,16 @@ class TubeTable(Table):
     """number of points of a layer at which stresses are computed."""
 
 
+class ViscosityTable(Table):
+    """How the stress of a specimen's law relaxes: docs/viscosity.md."""
+
+    kind: Literal["prony", "spectrum"] = "prony"
+    """prony: relaxation_1 and tau_1 (s), and so on for each term; spectrum: Fung's continuous one,
+    with spectrum, tau_1 and tau_2 (s)."""
+    terms: int | None = None
+    """number of terms, 1 by default; of points of a spectrum, 16 by default."""
+
+
 class SceneFile(Table):
     """A whole scene file."""
 
@@ -113,6 +123,8 @@ class SceneFile(Table):
     the verdict says that nobody told."""
     tube: TubeTable | None = None
     """of a specimen that is a tube, whose table has radii and stretch_axial."""
+    viscosity: ViscosityTable | None = None
+    """of a specimen whose table has a column time (s); without it, the specimen is elastic."""
     parameters: dict[str, ParameterTable]
     """what varies: parameters of the law, of loads and of the stiffness."""
     supports: tuple[Annotated[BoundaryCondition, OneOf("kind", SUPPORTS, "held")], ...] = ()

@@ -11,13 +11,14 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar
 
 import jax
 import numpy as np
 
-from emulator.core.cells import Cells
+from emulator.core.cells import Cells, read_cells
 from emulator.core.display import TableRepr
 from emulator.core.errors import InputError
 from emulator.geometry.fibres import check_across, checked_directions
@@ -94,6 +95,10 @@ class ForwardProblem(TableRepr):
     def tissue_at(self, theta: jax.Array) -> Tissue:
         """Return material data at ``theta`` (p,), stacked over elements and points, or states."""
 
+    def read_table(self, path: Path) -> Cells:
+        """Return the rows of a data file that are data of this problem."""
+        return read_cells(path)
+
     # Theta: the parameters, in their box.
 
     @cached_property
@@ -159,6 +164,11 @@ class ForwardProblem(TableRepr):
         owners |= {q.name: (q, "a region") for q in stiffness_quantities(self.regions, None)}
         add_owners(owners, "the fibres'", self.angles)
         return owners
+
+    @property
+    def tissue_parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that are of the material, wherever it is."""
+        return self.law.parameters
 
     def _check_directions(self, count: int, points: int, loads: Sequence[Load] = ()) -> None:
         """Refuse directions and angles that do not fit; keep them as frozen arrays.

@@ -12,6 +12,8 @@ from emulator.scenes.fibre_rules import Uniform
 from emulator.specimens.grips import Grips, GripStresses
 from emulator.specimens.specimen import Specimen, read_states
 from emulator.specimens.tube import Tube
+from emulator.viscosity.series import Viscosity
+from emulator.viscosity.times import read_times
 
 if TYPE_CHECKING:  # pydantic is imported when a scene file is read, not with the package
     from emulator.core.schema import Source
@@ -35,12 +37,17 @@ def of_specimen(
         if file.tube is not None and file.grips not in (None, "none"):
             raise InputError("a tube is a specimen without grips")
         tube = None if file.tube is None else Tube(**file.tube.model_dump())
+    with source.at("viscosity", table=("viscosity",)):
+        viscosity = None if file.viscosity is None else Viscosity(**file.viscosity.model_dump())
     with source.at("specimen"):
         assert file.specimen is not None
-        table = read_cells(folder / file.specimen)
-        states = read_states(table, tube)
+        table = read_cells(folder / file.specimen, unloading=viscosity is not None)
+        states = read_states(table, tube, timed=viscosity is not None)
     entries: dict[str, Any] = {"states": states, "tube": tube, "table": table}
     entries["homogeneous"] = file.grips == "none"
+    if viscosity is not None:
+        with source.at("specimen"):
+            entries |= {"viscosity": viscosity, "times": read_times(table)}
     with source.at("fibres", table=("fibres",)):
         if isinstance(file.fibres, Uniform):
             fibres, sheets, angles = file.fibres.repeated(len(states.free))

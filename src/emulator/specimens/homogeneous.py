@@ -40,6 +40,15 @@ from emulator.mechanics.kinematics import cofactor
 from emulator.scenes.scene import all_nodes, check_nodes
 from emulator.specimens.specimen import Specimen, require_specimen
 from emulator.surrogates.protocol import ForwardKind, Prediction, fingerprint_of
+from emulator.viscosity.overstress import (
+    Memory,
+    TimeStep,
+    isochoric_stress,
+    linearised,
+    memory_after,
+    potential,
+    step_after,
+)
 
 _GUESSES = np.concatenate([[0.0], np.geomspace(0.01, 0.9, 20)])  # strains along a pull
 
@@ -108,15 +117,36 @@ class Homogeneous:
 
     def _evaluate(self, theta: jax.Array) -> Prediction:
         rows, of_node = np.unique(self.nodes // 3, return_inverse=True)
-        H, _, pulls, _ = self.scene.states
+        H, pulls = self.scene.states.gradients, self.scene.states.pulls
+        if self.scene.viscosity is not None:  # a state depends on those before it
+            rows, of_node = np.arange(len(H)), self.nodes // 3
         point = Point(point_energy(self.scene, theta), stress_and_moduli(self.scene, theta))
         tissue = jax.tree.map(lambda values: values[rows], self.scene.tissue_at(theta))
         guesses = _GUESSES if pulls.any() else _GUESSES[:0]
-        settled, converged = jax.vmap(partial(equilibrium, point, guesses))(
-            jnp.asarray(H[rows]), jnp.asarray(pulls[rows]), *self._free(rows), tissue
-        )
+        axes, last = self._free(rows)
+        states = jnp.asarray(H[rows]), jnp.asarray(pulls[rows]), axes, last, tissue
+        if self.scene.viscosity is None or not axes.shape[1]:  # else the motion says everything
+            settled, converged = jax.vmap(partial(equilibrium, point, guesses))(*states)
+        else:
+            settled, converged = self._through_time(point, guesses, theta, states)
         columns = jnp.swapaxes(settled, 1, 2)[of_node, self.nodes % 3]
         return Prediction(columns, jnp.all(converged))
+
+    def _through_time(
+        self, point: Point, guesses: np.ndarray, theta: jax.Array, states: Any
+    ) -> tuple[jax.Array, jax.Array]:
+        """Return what :func:`equilibrium` does of all ``states``, with viscosity."""
+        assert self.scene.viscosity is not None
+        series = self.scene.viscosity.series(self.scene.resolve(theta))
+
+        def advance(memory: Memory, interval: jax.Array, *state: Any) -> tuple[Memory, Any]:
+            step, tissue = step_after(memory, series, interval), state[-1]
+            of_step = _of_step(point, step, incompressible=self.incompressible)
+            H, converged = equilibrium(of_step, guesses, *state)
+            stress = isochoric_stress(point.energy, H, tissue)
+            return memory_after(memory, series, interval, stress), (H, converged)
+
+        return self.scene.histories.along(series, advance, states)
 
     def _free(self, rows: np.ndarray) -> tuple[jax.Array, jax.Array | None]:
         """Return the axes (e, u) of the free stretches, 3 for none, and that of the last, (e,).
@@ -167,6 +197,9 @@ class Homogeneous:
     @cached_property
     def _moduli(self) -> Callable[[jax.Array, jax.Array], jax.Array]:
         def moduli(H: jax.Array, theta: jax.Array) -> jax.Array:
+            if self.scene.viscosity is not None:
+                energy, states = _densities(self.scene, H, theta)
+                return jax.vmap(jax.hessian(energy))(*states)
             of_point = stress_and_moduli(self.scene, theta)
             return jax.vmap(of_point)(H, self.scene.tissue_at(theta))[1]
 
@@ -186,12 +219,13 @@ def homogeneous_stresses(
         p = \Big(\frac{\partial W}{\partial F_{ll}} - P_l\Big) \Big/ \operatorname{cof}(F)_{ll} .
 
     It vanishes where a compressible specimen is in equilibrium, and is the unknown of an
-    incompressible one.
+    incompressible one. With viscosity, W is the potential of the step that leads to the state.
 
     u : the displacement (3 m, 3) mm of all nodes of the specimen ``scene``.
     """
     free, H = scene.states.free, scene.gradients(u)
-    of_law = jax.vmap(jax.grad(point_energy(scene, theta)))(H, scene.tissue_at(theta))
+    energy, states = _densities(scene, H, theta)
+    of_law = jax.vmap(jax.grad(energy))(*states)
     last = np.where(free.any(axis=1), 2 - np.argmax(free[:, ::-1], axis=1), 3)
     cofactors = jax.vmap(cofactor)(H + jnp.eye(3))
     is_last = jnp.asarray(last[:, None] == np.arange(3))
@@ -199,6 +233,22 @@ def homogeneous_stresses(
     excess = jnp.diagonal(of_law, axis1=1, axis2=2) - scene.states.pulls
     pressure = jnp.sum(jnp.where(is_last, excess / along, 0.0), axis=1)
     return H, of_law - pressure[:, None, None] * cofactors
+
+
+def _densities(
+    scene: Specimen, H: jax.Array, theta: jax.Array
+) -> tuple[Callable[..., jax.Array], tuple[Any, ...]]:
+    """Return the energy density in kPa whose slope is a state's stress, and its arguments.
+
+    H : the gradients of all states, (m, 3, 3).
+    """
+    energy, tissue = point_energy(scene, theta), scene.tissue_at(theta)
+    if scene.viscosity is None:
+        return energy, (H, tissue)
+    series = scene.viscosity.series(scene.resolve(theta))
+    stresses = jax.vmap(partial(isochoric_stress, energy))(H, tissue)
+    steps = scene.histories.steps(series, stresses)
+    return lambda H, tissue, step: potential(energy, step)(H, tissue), (H, tissue, steps)
 
 
 class Point(NamedTuple):
@@ -210,6 +260,14 @@ class Point(NamedTuple):
 
     energy: Callable[..., jax.Array]
     moduli: Callable[..., tuple[jax.Array, jax.Array]]
+
+
+def _of_step(point: Point, step: TimeStep, *, incompressible: bool) -> Point:
+    """Return the potential of a step with viscosity in the place of the law's energy."""
+    energy = potential(point.energy, step, incompressible=incompressible)
+    if incompressible:
+        return Point(energy, partial(linearised, point.moduli, step))
+    return Point(energy, lambda *at: (jax.grad(energy)(*at), jax.hessian(energy)(*at)))
 
 
 def equilibrium(

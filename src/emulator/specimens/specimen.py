@@ -28,7 +28,7 @@ from emulator.geometry.mesh import Mesh, frozen_array
 from emulator.mechanics.laws import Law
 from emulator.mechanics.laws.law import law_identity
 from emulator.scenes.fibre_rules import FibreRule
-from emulator.scenes.forward_problem import ForwardProblem
+from emulator.scenes.forward_problem import ForwardProblem, Owners, add_owners
 from emulator.scenes.identity import Identity, described_fields, fingerprint
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import with_mesh
@@ -37,6 +37,9 @@ from emulator.specimens.grips import Grips
 from emulator.specimens.states import States, motion_columns, pull_columns, states
 from emulator.specimens.tube import Tube
 from emulator.specimens.tube import motion_columns as tube_columns
+from emulator.viscosity.overstress import Histories, histories
+from emulator.viscosity.series import Viscosity
+from emulator.viscosity.times import TIME, check_times, read_times
 
 _CONVENTIONS = (
     (r"(?:lambda|λ|stretch)_?([xyz])\1?", r"stretch_\1"),
@@ -59,6 +62,7 @@ _OF_TUBES = (
     (r"id", r"inner_diameter"),
     (r"p", r"pressure"),
 )
+_ROUND_OFF = 1e-6  # s by which equal times may differ
 _MANY, _MINUTES = 500, 1.0 / 180.0  # states worth a word, and what each takes on one core
 _MACHINES = {
     r"(extension|displacement|elongation|crosshead).*": "over the length at rest is strain_x [-]",
@@ -89,6 +93,9 @@ class Specimen(ForwardProblem):
     table : the table that the states were read from.
     homogeneous : whether somebody said that a piece without ``grips`` deforms evenly. It changes no
         solution: verdicts name the assumption, and by whom it is made.
+    viscosity : how the law's stresses relax, as a :class:`Viscosity` or the table of a scene file
+        (:mod:`emulator.viscosity`); None for an elastic specimen.
+    times : the time of each measured state, s, (d,); without viscosity it is left out.
     """
 
     name: str
@@ -105,6 +112,8 @@ class Specimen(ForwardProblem):
     grips: Grips | None = None
     table: Cells | None = None
     homogeneous: bool = False
+    viscosity: Viscosity | None = None
+    times: np.ndarray | None = None
 
     solved_by = "emulator.specimens.homogeneous:homogeneous"
     usual_map = "incompressible"
@@ -115,6 +124,8 @@ class Specimen(ForwardProblem):
         return self.grips is not None and self.grips.learned is not None
 
     def __post_init__(self) -> None:
+        if isinstance(self.viscosity, Mapping):
+            object.__setattr__(self, "viscosity", Viscosity(**self.viscosity))
         H, free, pulls, tests = self.states
         count = len(free)
         rows = MappingProxyType({name: frozen_array(k, int) for name, k in tests.items()})
@@ -137,6 +148,7 @@ class Specimen(ForwardProblem):
                     "grips move a specimen; with applied stresses they are not supported: leave "
                     "out one of the two"
                 )
+            self._check_viscosity()
         except InputError as error:
             raise InputError(f"scene '{self.name}': {error}") from error
 
@@ -147,6 +159,49 @@ class Specimen(ForwardProblem):
         points = 1 if self.tube is None else self.tube.size
         rows = {name: of_test[::points] // points for name, of_test in tests.items()}
         return States(H[::points], free[::points], pulls[::points], rows)
+
+    def _check_viscosity(self) -> None:
+        """Refuse viscosity without times, of a law of small strains, or with grips."""
+        if self.viscosity is None:
+            object.__setattr__(self, "times", None)
+            return
+        if self.times is None:
+            raise InputError(f"viscosity needs the time of each state; give '{TIME}', in s")
+        if not self.law.objective:
+            raise InputError(f"law '{self.law.name}' is of small strains; viscosity needs another")
+        if self.grips is not None:
+            raise InputError("grips are solved without time; leave out viscosity or grips")
+        object.__setattr__(self, "times", frozen_array(self.times))
+        check_times(self.times, self.measured.protocols, len(self.measured.free))
+
+    def _owners(self) -> Owners:
+        owners = super()._owners()
+        add_owners(owners, "the scene's", [] if self.viscosity is None else [self.viscosity])
+        return owners
+
+    @property
+    def tissue_parameters(self) -> tuple[str, ...]:
+        """Names of the parameters of the law and of its viscosity."""
+        of_viscosity = () if self.viscosity is None else self.viscosity.quantities
+        return (*self.law.parameters, *(quantity.name for quantity in of_viscosity))
+
+    @cached_property
+    def histories(self) -> Histories:
+        """The points of the tests through time, of a specimen with viscosity."""
+        assert self.times is not None
+        size = 1 if self.tube is None else self.tube.size
+        return histories(self.states.protocols, self.times, size)
+
+    def read_table(self, path: Path) -> Cells:
+        """Return a table's rows, with viscosity those of unloading, too; refuse other times."""
+        if self.viscosity is None:
+            return super().read_table(path)
+        cells = read_cells(path, unloading=True)
+        times = read_times(cells)
+        assert self.times is not None  # of a specimen with viscosity
+        if times.shape != self.times.shape or np.abs(times - self.times).max() > _ROUND_OFF:
+            raise InputError(f"data file {path}: times are not those of scene '{self.name}'")
+        return cells
 
     @property
     def node_count(self) -> int:
@@ -196,13 +251,19 @@ def specimen(
     Parameters
     ----------
     given : its states, or the columns (m,) of one test, as
-        :func:`~emulator.specimens.states.states` takes them.
+        :func:`~emulator.specimens.states.states` takes them, and ``time`` in s with viscosity.
     ordered : see there.
     tube : the sector of a tube whose motion ``given`` is, see :mod:`emulator.specimens.tube`.
     entries : the other fields of a :class:`Specimen`.
     """
+    if isinstance(given, Mapping) and TIME in given:
+        entries = {"times": np.asarray(given[TIME], float), **entries}
+        given = {word: values for word, values in given.items() if word != TIME}
+    timed = entries.get("viscosity") is not None
     return Specimen(
-        states=given if isinstance(given, States) else states_in(given, tube=tube, ordered=ordered),
+        states=given
+        if isinstance(given, States)
+        else states_in(given, tube=tube, ordered=ordered, timed=timed),
         tube=tube,
         **{"name": "specimen", **entries},
     )
@@ -221,14 +282,19 @@ def states_in(
     *,
     tube: Tube | None = None,
     ordered: bool = True,
+    timed: bool = False,
 ) -> States:
     """Return the states that columns (m,) of a table describe, of a piece or of a tube's wall."""
-    read = states if tube is None else tube.states
-    return read(columns, protocols, ordered=ordered)
+    if tube is not None:
+        return tube.states(columns, protocols, ordered=ordered and not timed)
+    return states(columns, protocols, ordered=ordered, timed=timed)
 
 
-def read_states(table: Path | Cells, tube: Tube | None = None) -> States:
-    """Return the states of a table's rows; the column ``protocol`` names their tests."""
+def read_states(table: Path | Cells, tube: Tube | None = None, *, timed: bool = False) -> States:
+    """Return the states of a table's rows; the column ``protocol`` names their tests.
+
+    timed : as of :func:`~emulator.specimens.states.states`.
+    """
     cells = table if isinstance(table, Cells) else read_cells(table)
     path = cells.path
     moving = motion_columns if tube is None else tube_columns
@@ -251,7 +317,7 @@ def read_states(table: Path | Cells, tube: Tube | None = None) -> States:
             + ", ".join(filter(None, cells.words))
         )
     for row in rows if BRANCH in cells.words else ():
-        if (branch := cells.rows[row][BRANCH]).lower() not in ("", LOADING):
+        if (branch := cells.rows[row][BRANCH]).lower() not in ("", LOADING, UNLOADING):
             raise InputError(
                 f"data file {path}: row {row}, column '{BRANCH}' is '{branch}'; give '{LOADING}', "
                 f"or '{UNLOADING}' for rows that are left out"
@@ -262,7 +328,7 @@ def read_states(table: Path | Cells, tube: Tube | None = None) -> States:
         if names is not None and "" in names:
             row = names.index("") + 1
             raise InputError(f"row {row}, column '{PROTOCOL}' is empty; name the row's test")
-        return states_in(columns, names, tube=tube)
+        return states_in(columns, names, tube=tube, timed=timed)
     except InputError as error:
         # States count their rows from 1; in the file others may be between them.
         text = re.sub(r"\brow (\d+)", lambda m: f"row {rows[int(m[1]) - 1]}", str(error))

@@ -123,6 +123,7 @@ def states(
     protocols: Sequence[str] | None = None,
     *,
     ordered: bool = True,
+    timed: bool = False,
 ) -> States:
     """Return the states that columns (m,) of a table describe, NaN where a direction is free.
 
@@ -130,6 +131,7 @@ def states(
     ----------
     protocols : the name of each row's test; by default all rows are of one.
     ordered : whether the rows of a test lead away from rest, with the same directions free.
+    timed : whether they are in the order of time, so that they may go back.
 
     Raises
     ------
@@ -146,7 +148,9 @@ def states(
     _check(gradients, free, pulled, held)
     tests = rows_of([""] * count if protocols is None else protocols)
     for name, rows in tests.items() if ordered else ():
-        _check_path(gradients[rows], free[rows], pulls[rows], rows, name)
+        _check_control(free[rows], pulls[rows], rows, name)
+        if not timed:
+            _check_path(gradients[rows], pulls[rows], rows, name)
     return States(gradients, free, np.nan_to_num(pulls), tests)
 
 
@@ -247,13 +251,8 @@ def _check(H: np.ndarray, free: np.ndarray, pulled: np.ndarray, held: np.ndarray
         raise InputError(f"row {closed[0] + 1} turns the specimen inside out")
 
 
-def _check_path(
-    H: np.ndarray, free: np.ndarray, pulls: np.ndarray, rows: np.ndarray, name: str
-) -> None:
-    """Refuse a test in which a stretch or a pull is missing in some rows.
-
-    Or one that goes back: unloading, or a second test under the same name.
-    """
+def _check_control(free: np.ndarray, pulls: np.ndarray, rows: np.ndarray, name: str) -> None:
+    """Refuse a test in which a stretch or a pull is missing in some rows."""
     test = f" of '{name}'" if name else ""
     for what, missing in (("pull", np.isnan(pulls)), ("stretch", free)):
         for axis, gaps in zip(AXES, missing.T, strict=True):
@@ -262,6 +261,11 @@ def _check_path(
                     f"row {rows[np.argmax(gaps)] + 1}{test} has no {what} along {axis}, others "
                     "have: give it, leave the row out, or name another test in a column 'protocol'"
                 )
+
+
+def _check_path(H: np.ndarray, pulls: np.ndarray, rows: np.ndarray, name: str) -> None:
+    """Refuse a test that goes back: unloading, or a second test under the same name."""
+    test = f" of '{name}'" if name else ""
     ways = np.linalg.norm(H, axis=(1, 2)), np.linalg.norm(np.nan_to_num(pulls), axis=1)
     back = np.flatnonzero(falls(ways[0]) | falls(ways[1]))
     if not len(back):
