@@ -256,14 +256,14 @@ def specimen(
     tube : the sector of a tube whose motion ``given`` is, see :mod:`emulator.specimens.tube`.
     entries : the other fields of a :class:`Specimen`.
     """
-    if isinstance(given, Mapping) and TIME in given:
-        entries = {"times": np.asarray(given[TIME], float), **entries}
-        given = {word: values for word, values in given.items() if word != TIME}
-    timed = entries.get("viscosity") is not None
+    timed, columns = entries.get("viscosity") is not None, given
+    if isinstance(columns, Mapping) and TIME in columns:
+        entries = {"times": np.asarray(columns[TIME], float), **entries}
+        columns = {word: values for word, values in columns.items() if word != TIME}
+    if not isinstance(columns, States):
+        columns = states_in(columns, tube=tube, ordered=ordered, timed=timed)
     return Specimen(
-        states=given
-        if isinstance(given, States)
-        else states_in(given, tube=tube, ordered=ordered, timed=timed),
+        states=columns,
         tube=tube,
         **{"name": "specimen", **entries},
     )
