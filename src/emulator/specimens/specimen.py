@@ -256,17 +256,14 @@ def specimen(
     tube : the sector of a tube whose motion ``given`` is, see :mod:`emulator.specimens.tube`.
     entries : the other fields of a :class:`Specimen`.
     """
+    motion = given
     if isinstance(given, Mapping) and TIME in given:
         entries = {"times": np.asarray(given[TIME], float), **entries}
-        given = {word: values for word, values in given.items() if word != TIME}
-    timed = entries.get("viscosity") is not None
-    return Specimen(
-        states=given
-        if isinstance(given, States)
-        else states_in(given, tube=tube, ordered=ordered, timed=timed),
-        tube=tube,
-        **{"name": "specimen", **entries},
-    )
+        motion = {word: values for word, values in given.items() if word != TIME}
+    if not isinstance(motion, States):
+        timed = entries.get("viscosity") is not None
+        motion = states_in(motion, tube=tube, ordered=ordered, timed=timed)
+    return Specimen(states=motion, tube=tube, **{"name": "specimen", **entries})
 
 
 def require_specimen(problem: ForwardProblem) -> Specimen:
