@@ -256,17 +256,14 @@ def specimen(
     tube : the sector of a tube whose motion ``given`` is, see :mod:`emulator.specimens.tube`.
     entries : the other fields of a :class:`Specimen`.
     """
-    timed, columns = entries.get("viscosity") is not None, given
-    if isinstance(columns, Mapping) and TIME in columns:
-        entries = {"times": np.asarray(columns[TIME], float), **entries}
-        columns = {word: values for word, values in columns.items() if word != TIME}
-    if not isinstance(columns, States):
-        columns = states_in(columns, tube=tube, ordered=ordered, timed=timed)
-    return Specimen(
-        states=columns,
-        tube=tube,
-        **{"name": "specimen", **entries},
-    )
+    motion = given
+    if isinstance(given, Mapping) and TIME in given:
+        entries = {"times": np.asarray(given[TIME], float), **entries}
+        motion = {word: values for word, values in given.items() if word != TIME}
+    if not isinstance(motion, States):
+        timed = entries.get("viscosity") is not None
+        motion = states_in(motion, tube=tube, ordered=ordered, timed=timed)
+    return Specimen(states=motion, tube=tube, **{"name": "specimen", **entries})
 
 
 def require_specimen(problem: ForwardProblem) -> Specimen:
