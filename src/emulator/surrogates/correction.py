@@ -46,6 +46,7 @@ _NUGGETS = (1e-6, 1e-4, 1e-2, 1.0, 1e2)
 _FIRST_NUGGETS = (1e-6, 1e-2)  # with which lengths are compared
 _TREND = 1e2
 _MOST_OBSERVATIONS = 800  # beyond which derivatives at points that FEM finds unlikely are left out
+_SMOOTH = 10.0  # sds of the points that are the unit of features where errors hardly vary
 _NEGLIGIBLE = 1e-3  # leave-one-out error, in noise sd, that changes no posterior
 
 
@@ -161,9 +162,10 @@ def fit_correction(
     likely : (n,) bool, points that FEM finds likely, which decide what is best; all by default.
     like : the correction whose points and kernel are taken; by default they are searched for.
     slopes : the derivatives (n, q, m) of the errors in the features, NaN for a run without them.
-    exact : whether the errors are smooth, without a bump anywhere, so that a process passes through
-        all of them. "None" is then no candidate: of as many points as unknowns, each left out is
-        so badly continued by the others that none would seem better, whatever the errors are.
+    exact : whether the errors hardly vary over the points, and have no bump, so that a process of
+        small slopes and long lengths passes through all of them. "None" is then no candidate: of as
+        many points as unknowns, each left out is so badly continued by the others that none would
+        seem better, whatever the errors are.
     """
     every = np.ones(len(x), dtype=bool)
     likely = every if likely is None or not likely.any() else likely
@@ -182,8 +184,8 @@ def fit_correction(
     )
     smallest = np.log(squared_errors[likely] + _NEGLIGIBLE**2).mean()
     for used in parts:
-        nuggets = _FIRST_NUGGETS if exact else _NUGGETS
-        fitted, loss = _fitted(x[used], observed[used], scales, rows, likely[used], like, nuggets)
+        part = x[used], observed[used], scales, rows, likely[used]
+        fitted, loss = _fitted(*part, like, exact=exact)
         if exact or loss < smallest:
             best, smallest = fitted._replace(local=used is not every), loss
     return best
@@ -212,15 +214,17 @@ def _fitted(
     rows: int,
     likely: np.ndarray,
     like: Correction | None,
-    nuggets: tuple[float, ...],
+    *,
+    exact: bool,
 ) -> tuple[Correction, float]:
     """Return the process of these points, and the mean log of its errors where it is ``likely``.
 
     observed : the errors and their derivatives (n, 1 + q, m), NaN where there are none.
-    like : the correction whose kernel is taken; None to search for one, with one of ``nuggets``.
+    like : the correction whose kernel is taken; None to search for one.
+    exact : as of :func:`fit_correction`.
     """
     count, per_run, data = observed.shape
-    width = x.std(axis=0)
+    width = x.std(axis=0) * (_SMOOTH if exact else 1.0)
     centre, width = x.mean(axis=0), np.where(width > 0.0, width, 1.0)
     x = (x - centre) / width
     known = np.isfinite(observed).all(axis=2).ravel()
@@ -248,7 +252,7 @@ def _fitted(
     if like is None:
         processes = [process(*kernel) for kernel in product(_LENGTHS, _FIRST_NUGGETS)]
         length = min(processes, key=lambda p: p.loss).length
-        processes += [process(length, n) for n in nuggets if n not in _FIRST_NUGGETS]
+        processes += [process(length, n) for n in _NUGGETS if n not in _FIRST_NUGGETS and not exact]
     else:
         processes = [process(like.length, like.nugget)]
     best = min(processes, key=lambda p: p.loss)

@@ -46,7 +46,7 @@ def finer_than(fem, model, stretch, shift):
     return fine, differences
 
 
-@pytest.mark.parametrize(("stretch", "shift"), [(0.0, 0.01), (0.02, 0.0), (0.0, 0.3)])
+@pytest.mark.parametrize(("stretch", "shift"), [(0.0, 0.01), (0.02, 0.0), (0.0, 0.1)])
 def test_shifts_are_those_of_the_quadrature(fem, check, stretch, shift):
     data, found = check
     model = found.posterior.model
@@ -63,6 +63,22 @@ def test_shifts_are_those_of_the_quadrature(fem, check, stretch, shift):
         assert abs(told.log_sd[name].value - np.log(sd_after / sd)[k]) < (
             4.0 * told.log_sd[name].error + 0.02
         )
+
+
+def test_a_posterior_far_away_is_followed(fem, check):
+    """By 3.7 sd: the pool's points tell the sd, and so the shift, to a tenth; the limit is 0.25."""
+    data, found = check
+    model = found.posterior.model
+    fine, differences = finer_than(fem, model, 0.0, 0.3)
+    by_fem = lambda z: differences(z, found.pool.predictive)
+    told = change_by(by_fem, found.pool, found.tests.runs, (8, 8), np.random.default_rng(0))
+    points, weights, moved = grid_of(), quadrature(fem, data), quadrature(fine, data)
+    mean, after = weights @ points, moved @ points
+    exact = (after - mean) / np.sqrt(weights @ (points - mean) ** 2)
+    assert np.abs(exact).max() > 3.0
+    for k, name in enumerate(model.names):
+        assert abs(told.shift[name].value - exact[k]) < 0.1 * np.abs(exact).max()
+        assert abs(told.log_sd[name].value) < 0.2
 
 
 def test_points_are_added_until_every_figure_is_decided(fem, check):
