@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.cells import BRANCH, LOADING, PROTOCOL, UNLOADING, Cells, read_cells
-from emulator.core.errors import InputError
+from emulator.core.errors import InputError, check_known
 from emulator.core.units import with_unit
 from emulator.geometry.mesh import Mesh, frozen_array
 from emulator.mechanics.laws import Law
@@ -125,6 +125,8 @@ class Specimen(ForwardProblem):
 
     def __post_init__(self) -> None:
         if isinstance(self.viscosity, Mapping):
+            for word in self.viscosity:
+                check_known(word, [f.name for f in fields(Viscosity)], "viscosity: entry")
             object.__setattr__(self, "viscosity", Viscosity(**self.viscosity))
         H, free, pulls, tests = self.states
         count = len(free)

@@ -301,6 +301,7 @@ def test_an_elastic_specimen_computes_nothing_of_viscosity(monkeypatch):
             {"constants": {"kappa": 1.0, "tau_1": 1.0, "relaxation_1": 1.2}},
             "'relaxation_1' is 1.2; it must be below 1",
         ),
+        ({"viscosity": {"term": 2}}, "viscosity: entry 'term' is unknown"),
         ({"viscosity": {"kind": "maxwell"}}, "kind 'maxwell'; use prony or spectrum"),
         ({"law": em.find_law("small_strain")}, "law 'small_strain' is of small strains"),
         ({"grips": em.specimens.Grips((1.0, 1.0, 1.0))}, "leave out viscosity or grips"),
