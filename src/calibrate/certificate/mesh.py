@@ -264,10 +264,12 @@ def _corrections_by(predictive: Predictive, runs: FEMRuns) -> CorrectionBy:
     x, usable = predictive.features(runs.z), valid & runs.converged
     errors_on_mesh = runs.means - means
 
+    few, rows = usable.sum() < x.shape[1] + 2, len(runs.z)
+
     def fitted(errors: np.ndarray, like: Correction | None = None) -> Correction:
-        if usable.sum() < x.shape[1] + 2:
-            return no_correction(len(runs.z), x.shape[1], errors.shape[1])
-        likely, rows = runs.likely[usable], len(runs.z)
+        if few:
+            return no_correction(rows, x.shape[1], errors.shape[1])
+        likely = runs.likely[usable]
         return fit_correction(x[usable], errors[usable], predictive.scales, rows, likely, like)
 
     on_mesh = fitted(errors_on_mesh)
@@ -277,8 +279,12 @@ def _corrections_by(predictive: Predictive, runs: FEMRuns) -> CorrectionBy:
     ) -> tuple[Correction, Correction]:
         if not len(z):
             return on_mesh, on_mesh
-        x_fine, scales = predictive.features(z), predictive.scales
-        of_mesh = fit_correction(x_fine, D, scales, len(z), like=like, exact=True)
+        # Few runs do not continue the map's errors; the differences are continued by themselves.
+        size = max(rows, len(z)) if few else len(z)
+        points, scales = predictive.features(z), predictive.scales
+        of_mesh = fit_correction(points, D, scales, size, like=like, exact=True)
+        if few:
+            return of_mesh, of_mesh
         errors = errors_on_mesh + np.asarray(corrections(of_mesh, x))
         return fitted(errors, like=on_mesh), of_mesh
 

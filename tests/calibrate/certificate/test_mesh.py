@@ -81,6 +81,20 @@ def test_a_posterior_far_away_is_followed(fem, check):
         assert abs(told.log_sd[name].value) < 0.2
 
 
+def test_a_mesh_counts_where_few_runs_converged(fem, check):
+    """Nothing corrects the map then, which is right here; the mesh's shift is what it was."""
+    _, found = check
+    _, differences = finer_than(fem, found.posterior.model, 0.0, 0.01)
+    by_fem = lambda z: differences(z, found.pool.predictive)
+    runs, failed = found.tests.runs, np.full_like(found.tests.runs.means, np.nan)
+    shifts = [
+        change_by(by_fem, found.pool, of, (8, 8), np.random.default_rng(0)).shift["mu"].value
+        for of in (runs, runs._replace(means=failed))
+    ]
+    assert abs(shifts[0]) > 0.1
+    assert abs(shifts[1] - shifts[0]) < 0.01
+
+
 def test_points_are_added_until_every_figure_is_decided(fem, check):
     """A mesh that moves a mean by just the limit is never decided; one that moves none, at once."""
     _, found = check
