@@ -252,6 +252,9 @@ class _FebioReading:
 
     def _fung(self, tag: Tag) -> Parameters:
         E = [number(self.file, tag, name) for name in ("E1", "E2", "E3")]
+        c, kappa = (number(self.file, tag, name) for name in ("c", "k"))
+        if not min(*E, c) > 0.0:
+            raise self.file.error(tag.line, "E1, E2, E3 and c of the material; expected above 0")
         compliance = np.diag(1.0 / np.array(E))
         for row, name in enumerate(("v12", "v23", "v31")):
             column = (row + 1) % 3
@@ -260,7 +263,6 @@ class _FebioReading:
         if np.linalg.eigvalsh(compliance)[0] <= 0.0:
             raise self.file.error(tag.line, "E and v of the material are no positive stiffness")
         shear = [number(self.file, tag, name) for name in ("G12", "G23", "G31")]
-        c, kappa = (number(self.file, tag, name) for name in ("c", "k"))
         S = jnp.asarray(compliance)
         stiffness = np.asarray(cofactor(S) / determinant(S))  # S is symmetric
         return materials.fung(c, stiffness, shear, kappa)

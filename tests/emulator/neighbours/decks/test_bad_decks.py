@@ -29,6 +29,8 @@ TWO = DECK.replace("</MeshDomains>", '<SolidDomain name="P" mat="other"/></MeshD
     "</Material>", f"{SECOND}</Material>", 1
 )
 BILLION = '<!DOCTYPE a [<!ENTITY b "bb"><!ENTITY c "&b;&b;">]>\n<febio_spec'
+FUNG = "".join(f"<E{k}>0</E{k}><v{k}{k % 3 + 1}>0</v{k}{k % 3 + 1}>" for k in (1, 2, 3))
+FUNG += "<G12>1</G12><G23>1</G23><G31>1</G31><c>1</c><k>9</k>"
 INP = abaqus("*Hyperelastic, neo hooke\n2.0, 0.025", abaqus_supports())
 
 
@@ -56,6 +58,7 @@ INP = abaqus("*Hyperelastic, neo hooke\n2.0, 0.025", abaqus_supports())
         (DECK.replace('"neo-Hookean"', '"isotropic elastic"'), "material 'isotropic elastic' is no"),
         (DECK.replace("<v>0.3</v>", ""), 'type="neo-Hookean"> has no <v>'),
         (DECK.replace("<v>0.3</v>", "<v>0.5</v>"), "line 5: parameter 'nu' is 0.5"),
+        (DECK.replace(MATERIAL, f'type="Fung orthotropic">{FUNG}'), "c of the material; expected"),
         (DECK.replace('mat="tissue"', 'mat="tisue"'), "material 'tisue' is not in the deck"),
         (DECK.replace('lc="1"', 'lc="7"'), "load curve 7 is not there, or has no points"),
         (TWO.format("incomp neo-Hookean"), "a second material: 'neo_hookean_split', not 'neo_"),
