@@ -86,8 +86,8 @@ def read_measurements(
         if table is not None and table.path.samefile(file):
             by_state = read_csv(table._replace(path=file), scene.load_parameters)
         else:
-            cells = scene.read_table(file) if of_cells else None
-            by_state = read_csv(cells, scene.load_parameters) if cells else read_netcdf(file)
+            rows = scene.read_table(file) if of_cells else None
+            by_state = read_csv(rows, scene.load_parameters) if rows else read_netcdf(file)
         for inner, content in by_state.items():
             state = ".".join(filter(None, (prefix, inner)))
             known |= {in_state(name, state): value for name, value in content.known.items()}

@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 import jax
 import numpy as np
 
-from emulator.core.cells import Cells, read_cells
+from emulator.core.cells import Cells
 from emulator.core.display import TableRepr
 from emulator.core.errors import InputError
 from emulator.geometry.fibres import check_across, checked_directions
@@ -95,9 +95,9 @@ class ForwardProblem(TableRepr):
     def tissue_at(self, theta: jax.Array) -> Tissue:
         """Return material data at ``theta`` (p,), stacked over elements and points, or states."""
 
-    def read_table(self, path: Path) -> Cells:
-        """Return the rows of a data file that are data of this problem."""
-        return read_cells(path)
+    def read_table(self, path: Path) -> Path | Cells:
+        """Return a data file, or its rows where this problem reads others than is usual."""
+        return path
 
     # Theta: the parameters, in their box.
 

@@ -194,7 +194,7 @@ class Specimen(ForwardProblem):
         size = 1 if self.tube is None else self.tube.size
         return histories(self.states.protocols, self.times, size)
 
-    def read_table(self, path: Path) -> Cells:
+    def read_table(self, path: Path) -> Path | Cells:
         """Return a table's rows, with viscosity those of unloading, too; refuse other times."""
         if self.viscosity is None:
             return super().read_table(path)

@@ -17,6 +17,7 @@ import numpy as np
 from emulator.mechanics.kinematics import Strain, cofactor
 from emulator.viscosity.series import Series
 
+_FOREVER = 1e30  # s
 Energy = Callable[..., jax.Array]
 """The energy density in kPa of a displacement gradient (3, 3) and what else it reads."""
 
@@ -50,7 +51,8 @@ def at_rest(series: Series) -> Memory:
 
 def _decay(series: Series, interval: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return what is left of overstress after an interval, and of stress added evenly, (a,)."""
-    x = interval / series.times
+    # An infinite interval has infinite derivatives in the times, which times 0 are NaN.
+    x = jnp.minimum(interval, _FOREVER) / series.times
     small = x < 1e-9
     safe = jnp.where(small, 1.0, x)  # else the unused branch has the derivative of 0/0
     return jnp.exp(-x), jnp.where(small, 1.0 - 0.5 * x, -jnp.expm1(-safe) / safe)

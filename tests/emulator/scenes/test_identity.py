@@ -28,6 +28,7 @@ from emulator.specimens.grips import Grips, GripStresses
 from emulator.specimens.specimen import Specimen, specimen
 from emulator.specimens.states import states
 from emulator.specimens.tube import Tube
+from emulator.viscosity.series import Viscosity
 from scene_support import block
 
 
@@ -368,11 +369,30 @@ def test_every_field_of_a_scene_counts():
 
 
 def test_every_field_of_a_specimen_counts():
-    assert set(FIELDS_OF_SPECIMENS) | _LEFT_OUT == {each.name for each in fields(Specimen)}
+    through_time = {"viscosity", "times"}  # below
+    assert set(FIELDS_OF_SPECIMENS) | _LEFT_OUT | through_time == {
+        each.name for each in fields(Specimen)
+    }
     pieces = [specimen_of()]
     pieces += [specimen_of(**{name: value}) for name, value in FIELDS_OF_SPECIMENS.items()]
     assert len({piece.fingerprint for piece in pieces}) == len(pieces)
     assert specimen_of(homogeneous=True, name="other").fingerprint == pieces[0].fingerprint
+
+
+def test_viscosity_and_times_of_a_specimen_count():
+    """Times are left out without viscosity; its kind and terms are all that it has."""
+    assert {each.name for each in fields(Viscosity)} == {"kind", "terms"}
+    times = np.arange(float(len(STATES.free)))
+
+    def viscous(viscosity, times=times):
+        constants = {quantity.name: 0.5 for quantity in viscosity.quantities}
+        constants |= specimen_of().constants
+        return specimen_of(constants=constants, viscosity=viscosity, times=times)
+
+    kinds = Viscosity(), Viscosity(terms=2), Viscosity("spectrum"), Viscosity("spectrum", 8)
+    pieces = [specimen_of(), *map(viscous, kinds), viscous(kinds[0], 2.0 * times)]
+    assert len({piece.fingerprint for piece in pieces}) == len(pieces)
+    assert specimen_of(times=times).fingerprint == pieces[0].fingerprint
 
 
 @pytest.mark.parametrize("name", PARTS_OF_FIELDS)
