@@ -43,7 +43,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -290,7 +290,8 @@ def _common_parameter(members: Mapping[str, Model], name: str) -> Parameter:
     parameters = {m: s.parameters[s.parameter_names.index(base)] for m, s in scenes.items()}
     (first, parameter), *others = parameters.items()
     for member, other in others:
-        if other != parameter:
+        # What the scene file says of its value is not asked: members have the prior of their run.
+        if replace(other, prior=None) != replace(parameter, prior=None):
             raise InputError(
                 f"hierarchy: '{name}' is {_in_words(parameter)} for '{first}' and "
                 f"{_in_words(other)} for '{member}': a population has one range and one scale"

@@ -1,12 +1,17 @@
 """Which unknowns are shared: the material, not the loads of a member or of its load states."""
 
+from types import SimpleNamespace
+
 import jax
 import numpy as np
 import pytest
 
 import calibrate as cal
+import emulator as em
 from calibrate.population import population_model
+from calibrate.population.model import _common_parameter
 from emulator.core.errors import InputError
+from emulator.scenes.parameter_space import LogNormal
 from linear_support import linear_forward
 
 
@@ -44,3 +49,17 @@ def test_priors_are_on_the_parameter_s_scale(beam):
     medians = np.log(np.asarray(found.median["mu"].sample(jax.random.key(1), (5000,))))
     assert medians.mean() == pytest.approx(0.5 * np.log(50.0 * 100.0), abs=0.01)
     assert medians.std() == pytest.approx(0.54 * 0.5 * np.log(2.0), rel=0.05)  # cut at one sd
+
+
+def test_members_share_ranges_but_not_what_their_scene_files_say_of_them():
+    """Scene files that are drafted from each member's data state another prior each."""
+
+    def member(median, low=0.1):
+        prior = LogNormal(median, 1.0, "a guess")
+        parameter = em.Parameter("mu", "kPa", low, 9.0, "log", prior)
+        scene = SimpleNamespace(parameters=(parameter,), parameter_names=("mu",))
+        return SimpleNamespace(forward=SimpleNamespace(scene=scene))
+
+    assert _common_parameter({"a": member(1.0), "b": member(2.0)}, "mu").low == 0.1
+    with pytest.raises(InputError, match="a population has one range and one scale"):
+        _common_parameter({"a": member(1.0), "b": member(1.0, low=0.2)}, "mu")
