@@ -289,7 +289,7 @@ def tail_of(tests: Tests, missed: int, modes: int = 0) -> Tail:
         return Tail(np.inf, threshold, 0.0, np.inf, np.inf, points, missed, modes)
     weights = normalised(log_fem)
     share = normalised(np.where(both, log_map, -np.inf))[both]
-    ratio = (log_fem - log_map)[both]
+    ratio = log_fem[both] - log_map[both]
     return Tail(
         pareto_shape(log_fem[np.isfinite(log_fem)]),
         threshold,
