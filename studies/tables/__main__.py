@@ -178,8 +178,8 @@ def main() -> None:
     if not tables or arguments.quick:
         results.case("made", lambda: case(*made(), arguments.peers))
     for name, folder in {} if arguments.quick else tables.items():
-        table = read(folder)
-        results.case(name, lambda table=table: case(*table, arguments.peers))
+        x, y = read(folder)
+        results.case(name, lambda x=x, y=y: case(x, y, arguments.peers))
     results.write()
     draw(results.cases, arguments.out / "tables.png")
     for done in results.cases:

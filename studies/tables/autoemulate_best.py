@@ -62,6 +62,7 @@ def main() -> None:
     problem = np.load(sys.argv[1], allow_pickle=False)
     x, y, apart = problem["x"], problem["y"], problem["apart"]
     limit, begin = float(problem["seconds"]), monotonic()
+    tries: list[tuple[str, str, dict[str, object]]]
     tries = [(model, "untuned", {"model_params": {}}) for model in UNTUNED]
     tries += [(model, "tuned", {"n_iter": TRIALS, "n_splits": SPLITS}) for model in TUNED]
     scores, names, best = [], [], None
