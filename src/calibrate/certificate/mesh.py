@@ -263,7 +263,6 @@ def _corrections_by(predictive: Predictive, runs: FEMRuns) -> CorrectionBy:
     means, valid = predictive.means(runs.z)
     x, usable = predictive.features(runs.z), valid & runs.converged
     errors_on_mesh = runs.means - means
-
     few, rows = usable.sum() < x.shape[1] + 2, len(runs.z)
 
     def fitted(errors: np.ndarray, like: Correction | None = None) -> Correction:

@@ -290,7 +290,7 @@ def _common_parameter(members: Mapping[str, Model], name: str) -> Parameter:
     parameters = {m: s.parameters[s.parameter_names.index(base)] for m, s in scenes.items()}
     (first, parameter), *others = parameters.items()
     for member, other in others:
-        # What the scene file says of its value is not asked: members have the prior of their run.
+        # A member has the prior of its run; the scene file may state another for each.
         if replace(other, prior=None) != replace(parameter, prior=None):
             raise InputError(
                 f"hierarchy: '{name}' is {_in_words(parameter)} for '{first}' and "

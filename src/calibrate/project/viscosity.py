@@ -21,15 +21,13 @@ _DECADES = 1.5  # of times that a hold has for a second term
 
 
 class ViscosityDraft(NamedTuple):
-    """What is proposed for a table.
+    """The viscosity that is proposed for a table.
 
-    viscosity, times : of the specimen; the times (d,) are in s.
     reasons : what the table shows, in words.
     lines : of the scene file.
     """
 
     viscosity: Viscosity
-    times: np.ndarray
     reasons: tuple[str, ...]
     lines: tuple[str, ...]
 
@@ -61,7 +59,7 @@ def draft_viscosity(cells: Cells, tube: Tube | None) -> tuple[Cells, ViscosityDr
     held = any("hold" in reason for reason in reasons)
     viscosity = Viscosity(terms=2 if held and slow > 10.0**_DECADES * fast else 1)
     lines = tuple(_lines(viscosity, fast, slow))
-    return cells, ViscosityDraft(viscosity, times, reasons, lines)
+    return cells, ViscosityDraft(viscosity, reasons, lines)
 
 
 def _reasons(

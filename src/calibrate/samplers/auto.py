@@ -77,6 +77,8 @@ def _by_importance(
         return f"the weights' tail is heavy, Pareto k {shape:.2f}"
     if not converged(draws.z, options.r_hat, options.ess):
         return "independent populations disagree"
+    if judged == importance:
+        return draws  # of as many rounds as it took
     z, statistics, attributes = draws
     z, statistics = jax.tree.map(lambda of_chain: of_chain[:, : options.draws], (z, statistics))
     return Draws(z, statistics, attributes)

@@ -14,8 +14,9 @@ elastic: a specimen that keeps its volume is the limit of a large bulk modulus. 
 of Holzapfel, *Nonlinear Solid Mechanics* (2000), Section 6.10, with fractions :math:`g_a` of the
 instantaneous stress, as in Simo's article, in place of multiples of the relaxed one: then any
 :math:`g_\infty > 0` is stable, and fractions have bounds. **Moduli of the law are instantaneous.**
-Those of equilibrium, after a long time, are :math:`g_\infty` times as large: for an infinite rate
-the specimen is W, for rate zero :math:`W_\text{vol} + g_\infty W_\text{iso}`.
+The moduli of equilibrium, after a long time, are :math:`g_\infty` times as large. The energy of
+a specimen is W for an infinite rate, and for rate zero
+:math:`W_\text{vol} + g_\infty W_\text{iso}`.
 
 Over a time step in which :math:`S_\text{iso}` goes linearly from the old to the new value the
 solution is exact (Taylor, Pister and Goudreau 1970), for every step stable, and of second order

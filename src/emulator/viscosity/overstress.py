@@ -23,7 +23,7 @@ Energy = Callable[..., jax.Array]
 
 
 class Memory(NamedTuple):
-    """What a point remembers.
+    """The memory of a point: it determines the next steps together with the motion.
 
     overstress : the overstress of each term, kPa, (a, 3, 3).
     stress : the isochoric second Piola-Kirchhoff stress of the law, kPa, (3, 3).

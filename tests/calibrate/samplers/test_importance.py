@@ -14,8 +14,8 @@ from calibrate.importance.weights import normalised
 from calibrate.posterior.diagnosis import diagnose
 from calibrate.samplers import Density, ImportanceOptions, density_of, find_sampler
 from calibrate.samplers.auto import AUTO, NOT_BY_IMPORTANCE, SAMPLED_BY, AutoOptions
-from calibrate.samplers.importance import IMPORTANCE, _Run
-from calibrate.samplers.protocol import Context
+from calibrate.samplers.importance import IMPORTANCE, ImportanceSampling, _Run
+from calibrate.samplers.protocol import Context, Draws
 from emulator.core.errors import InputError, SolverError
 from emulator.surrogates.fem import fem_forward
 from linear_support import bent_problem, linear_problem, share_and_evidence
@@ -217,6 +217,16 @@ def test_few_draws_are_taken_from_populations_that_agree(beam):
     assert few.attributes[SAMPLED_BY] == "importance"
     assert few.z.shape == (2, 60, 2)
     assert few.statistics["lp"].shape == (2, 60)
+
+
+def test_draws_of_further_rounds_are_all_kept(beam, monkeypatch):
+    model, data = linear_problem(beam)
+    model, checked = model.given(data)
+    z = np.random.default_rng(0).normal(size=(2, 3000, 2))
+    several = Draws(z, {"lp": z[..., 0]}, {"weights_pareto_k": 0.1})
+    monkeypatch.setattr(ImportanceSampling, "sample", lambda *_: several)
+    draws = AUTO.sample(density_of(model), checked, AutoOptions(chains=2, rounds=3), Context())
+    assert draws.z.shape == z.shape
 
 
 class Refusing:
