@@ -27,6 +27,7 @@ QUICK = {
     "blind": "--data MEASURED --quick",
     "blood_clots": "--data MEASURED/blood_clots --quick",
     "certificate": "--quick",
+    "cohorts": "--data MEASURED --quick",
     "fem_speed": "--quick",
     "human_heart": "--data MEASURED/human_heart --quick",
     "human_myocardium": "--data MEASURED/myocardium_tables --quick",

@@ -17,12 +17,12 @@ import sys
 import tempfile
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from studies.blind.pieces import SETS, Piece
 from studies.common.figures import BLUE, ORANGE, pyplot
 from studies.common.output import Case, Results, parser, run, save
+from studies.common.pieces import SETS, Piece
+from studies.common.processes import calibrate
 
 import emulator as em
 
@@ -44,17 +44,6 @@ JUDGES = {
 }
 
 
-def command(folder: Path, *words: str) -> Any:
-    """The answer of a command of ``calibrate`` in ``folder``."""
-    program = str(Path(sys.executable).with_name("calibrate"))
-    done = subprocess.run(
-        [program, *words, "--json"], cwd=folder, capture_output=True, text=True, check=False
-    )
-    if not done.stdout.strip():
-        raise em.SolverError(f"calibrate {' '.join(words)}: {done.stderr.strip()[-500:]}")
-    return json.loads(done.stdout)
-
-
 def fold(piece: Piece, share: float) -> Case:
     """What was said of the states beyond ``share`` of each test's motion, and what is inside."""
     seen, ratio = piece.reached(share)
@@ -64,9 +53,9 @@ def fold(piece: Piece, share: float) -> Case:
         piece.write(folder / "seen.csv", seen)
         piece.write(folder / "all.csv", np.ones(len(seen), bool))
         for law in piece.laws:
-            command(folder, "init", "seen.csv", "--law", law, "--out", f"{law}.toml")
+            calibrate(folder, "init", "seen.csv", "--law", law, "--out", f"{law}.toml")
             words = ("--no-certify", "--seed", str(SEED), "--out", law)
-            told = command(folder, "infer", f"{law}.toml", *words)
+            told = calibrate(folder, "infer", f"{law}.toml", *words)
             sds = [row["mean"] for n, row in told["parameters"].items() if n.endswith("_sd")]
             noise[law], evidence[law] = float(np.linalg.norm(sds)), told.get("log_evidence")
         known = [law for law in piece.laws if evidence[law] is not None] or piece.laws
@@ -75,7 +64,7 @@ def fold(piece: Piece, share: float) -> Case:
         (folder / "all.toml").write_text(scene)
         asked = ("--scene", "all.toml", "--observe", f"stress:{','.join(names)}", "--draws", "1000")
         told = {
-            way: command(folder, "predict", *piece.laws, *asked, "--weights", way) for way in WAYS
+            way: calibrate(folder, "predict", *piece.laws, *asked, "--weights", way) for way in WAYS
         }
     measured, held = piece.measured, ~seen[:, None] & np.isfinite(piece.measured)
     scale = float(np.abs(measured[held]).mean())

@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import emulator as em
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -45,6 +47,16 @@ def printed(module: str, *words: object, compiled: bool = True) -> Any:
     if done.returncode:
         raise SystemExit(f"studies.{module} {' '.join(map(str, words))}: {done.stderr[-2000:]}")
     return json.loads(done.stdout.splitlines()[-1])
+
+
+def calibrate(folder: Path, *words: object) -> Any:
+    """The answer of a command of ``calibrate`` in ``folder``."""
+    program = str(Path(sys.executable).with_name("calibrate"))
+    words = (program, *map(str, words), "--json")
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False)
+    if not done.stdout.strip():
+        raise em.SolverError(f"calibrate {' '.join(words[1:-1])}: {done.stderr.strip()[-500:]}")
+    return json.loads(done.stdout)
 
 
 def peak_gb() -> float:

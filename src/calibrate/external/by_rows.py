@@ -1,8 +1,9 @@
 r"""What a table of runs says of a posterior, without a solver that could make more.
 
-The posterior has the emulator's error in its noise: where data have independent Gaussian noise of
-sd :math:`\sigma`, the model takes :math:`\sqrt{\sigma^2 + s^2}`, with :math:`s` the size of errors
-at rows that are left out (their 90 % quantile over a Gaussian's).
+The posterior allows for the emulator's error: data have Gaussian noise and an error of the
+emulator, whose covariance over the outputs is that of errors at rows that are left out (sds by
+their 90 % quantile over a Gaussian's). Outputs of one run are wrong together: taken for independent
+ones, 26 errors that are nearly one would pass for 26 facts.
 
 The verdict asks what a certificate asks, by how much the true solver would move the posterior, of
 what the rows leave open: error functions :math:`e_s` of the emulator are drawn from its process
@@ -34,9 +35,10 @@ from calibrate.importance.proposals import key_from
 from calibrate.importance.weights import effective, normalised
 from calibrate.posterior import Posterior
 from calibrate.project.problem import Problem
+from calibrate.state_names import split
 from calibrate.statistical_model.predictive import Predictive
 from emulator.core.errors import InputError
-from emulator.external.rows import RowsMap, process_in, samples_of
+from emulator.external.rows import RowsMap, correlations, process_in, samples_of
 from emulator.surrogates.correction import no_correction
 from emulator.surrogates.discrepancy import maximin_subset
 
@@ -45,19 +47,56 @@ NEXT = "next_runs.csv"
 _DRAWS, _FUNCTIONS = 400, 256  # of the posterior, and of the emulator's error
 _NEXT, _CANDIDATES = 8, 4  # runs to make next, each of so many draws
 _NORMAL_90 = 1.6449
+_LEAST_MODE = 1e-8  # of the largest variance: below it a mode is left to the noise
+EMULATOR_ERROR = "emulator"
+"""The name of an emulator's error among the systematic ones."""
 
 
-def with_emulator_noise(problem: Problem) -> Problem:
-    """Return the problem of a table with the emulator's error in the noise of each observation."""
-    process, noises = process_in(problem.scene), problem.run.noise
-    errors = np.quantile(np.abs(process.left_out), 0.9, axis=0) / _NORMAL_90
-    assert isinstance(noises, Mapping)
-    widened = dict(noises)
-    for name, (source, sd) in problem.observe.expand(noises, "noise").items():
-        if isinstance(sd, int | float):
-            of_emulator = np.sqrt(np.mean(errors[problem.observe.parts[name].nodes] ** 2))
-            widened[source] = float(np.hypot(sd, of_emulator))
-    return replace(problem, run=replace(problem.run, noise=widened))
+def with_emulator_error(problem: Problem) -> Problem:
+    """Return the problem of a table with the emulator's error besides the noise.
+
+    Beside a noise whose sd is inferred, or that is not Gaussian, errors that go together cannot be
+    integrated out: each known sd is then widened by its own error.
+    """
+    run, process = problem.run, process_in(problem.scene)
+    assert isinstance(run.noise, Mapping)
+    noises = problem.observe.expand(run.noise, "noise")
+    known = {name: sd for name, (_, sd) in noises.items() if isinstance(sd, int | float)}
+    if len(known) < len(noises):
+        widened = dict(run.noise)
+        for name, sd in known.items():
+            sds = _sds(process.left_out[:, problem.observe.parts[name].nodes])
+            widened[noises[name][0]] = float(np.hypot(sd, np.sqrt(np.mean(sds**2))))
+        return replace(problem, run=replace(run, noise=widened))
+    errors, of_state = {}, dict[str, list[str]]()
+    for name in problem.observe.parts:
+        of_state.setdefault(split(name)[1], []).append(name)
+    for state, names in of_state.items():
+        outputs = np.concatenate([problem.observe.parts[name].nodes for name in names])
+        modes = error_modes(process.left_out[:, outputs])
+        errors[f"{EMULATOR_ERROR} {state}".strip()] = {
+            "kind": "modes",
+            "of": "+".join(names),
+            "modes": modes.tolist(),
+        }
+    return replace(problem, run=replace(run, systematic={**run.systematic, **errors}))
+
+
+def error_modes(errors: np.ndarray) -> np.ndarray:
+    r"""Return the modes V (s, n) of the covariance :math:`C = V^T V` of errors (c, n).
+
+    With sds :math:`s_j` that a few far ones do not make, 90 % quantiles over a Gaussian's, and
+    correlations R, :math:`C_{jk} = s_j R_{jk} s_k = Q \Lambda Q^T` and
+    :math:`V = \Lambda^{1/2} Q^T`.
+    """
+    sds = _sds(errors)
+    values, vectors = np.linalg.eigh(np.outer(sds, sds) * correlations(errors))
+    used = values > _LEAST_MODE * values[-1]
+    return (vectors[:, used] * np.sqrt(values[used])).T
+
+
+def _sds(errors: np.ndarray) -> np.ndarray:
+    return np.quantile(np.abs(errors), 0.9, axis=0) / _NORMAL_90
 
 
 class _Moves(NamedTuple):

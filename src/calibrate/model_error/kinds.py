@@ -326,7 +326,33 @@ class FieldError:
         return Systematic(names, {n: rows[:, k] for k, n in enumerate(observations)}, size)
 
 
-Kind = RigidMotion | Placement | Pins | Gain | Curve | FieldError
+@dataclass(frozen=True)
+class Modes:
+    r"""Errors of which the covariance is known, :math:`C = V^T V`, as of an emulator's numbers.
+
+    of : the observations of d numbers together, joined by ``+``, missing ones included.
+    modes : the rows of V, (s, d) in the units of the data: the change of all these numbers, one
+        observation after the other, for one sd of each of s independent amounts.
+    """
+
+    of: str
+    modes: tuple[tuple[float, ...], ...]
+
+    def systematic(self, name: str, measurement: Measurement) -> Systematic:
+        """Return an unknown for each mode."""
+        shapes = {o: measurement.shape(o) for o in measurement.named(self.of)}
+        sizes = [int(np.prod(shape)) for shape in shapes.values()]
+        for row in self.modes:
+            if len(row) != sum(sizes):
+                raise InputError(f"modes: a row has {len(row)} numbers; {self.of} has {sum(sizes)}")
+        if not self.modes or not np.isfinite(self.modes).all():
+            raise InputError("modes: give one or more, of finite numbers")
+        parts = np.split(np.array(self.modes), np.cumsum(sizes)[:-1], axis=1)
+        modes = {o: V.reshape(-1, *shapes[o]) for o, V in zip(shapes, parts, strict=True)}
+        return Systematic(tuple(f"{name} {k + 1}" for k in range(len(self.modes))), modes)
+
+
+Kind = RigidMotion | Placement | Pins | Gain | Curve | FieldError | Modes
 
 SYSTEMATIC_ERRORS: dict[str, type[Kind]] = {
     "rigid_motion": RigidMotion,
@@ -335,6 +361,7 @@ SYSTEMATIC_ERRORS: dict[str, type[Kind]] = {
     "gain": Gain,
     "curve": Curve,
     "field": FieldError,
+    "modes": Modes,
 }
 """Kinds of systematic error by their word in a file."""
 

@@ -236,9 +236,9 @@ def by_rounds(problem: Problem) -> Problem:
         return problem
     mapped = read_problem(replace(run, forward=scene.usual_map), scene=scene)
     if not scene.has_solver:
-        (with_emulator_noise,) = offered("calibrate.external.by_rows", "with_emulator_noise")
-        widened: Problem = with_emulator_noise(mapped)
-        return widened
+        (with_emulator_error,) = offered("calibrate.external.by_rows", "with_emulator_error")
+        allowed: Problem = with_emulator_error(mapped)
+        return allowed
     return mapped
 
 

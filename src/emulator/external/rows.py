@@ -12,6 +12,9 @@ marginal likelihood times a log-normal prior of the lengths (median :math:`e^{3/
 1: an input that does nothing has a long one), on 900 rows at most; :math:`a^2` is the most likely
 one.
 
+Outputs of one run are wrong together: errors of processes are drawn with the correlations of their
+errors at rows that are left out.
+
 The error at a row that is left out has a closed form, :math:`e_i = (K^{-1} y)_i / (K^{-1})_{ii}`
 (Rasmussen and Williams 2006, Eq. 5.12). It is too small where lengths were fitted to that row, too.
 So the process is first fitted without a fifth of the rows; by how much its standardised errors
@@ -176,9 +179,24 @@ class Process(NamedTuple):
 
     def numbers(self, x: jax.Array) -> jax.Array:
         """Return the outputs (n,) at a position ``x`` (p,)."""
-        x = (x - self.centre) / self.width
-        kernels = jax.vmap(lambda logs: _kernel(logs, x[None], self.at)[0])(self.logs)
+        x, p = (x - self.centre) / self.width, self.at.shape[1]
+        # All modes by one product of matrices: |x - at|^2 / l^2 of each mode m and run c.
+        rates = np.exp(-2.0 * self.logs[:, :p])
+        squared = (rates @ x**2)[:, None] + rates @ self.at.T**2 - 2.0 * (rates * x) @ self.at.T
+        trend = np.exp(self.logs[:, -2:-1]) * (1.0 + self.at @ x)
+        kernels = _bell(squared) + trend
         return self.mean + self.sd * (jnp.sum(kernels * self.weights, axis=1) @ self.modes)
+
+    def correlations(self) -> np.ndarray:
+        """Return the correlations (m, m) of the modes' errors at rows that are left out."""
+        sizes = np.sum(self.modes**2, axis=1)
+        return correlations(self.left_out / self.sd @ (self.modes / sizes[:, None]).T)
+
+
+def correlations(errors: np.ndarray) -> np.ndarray:
+    """Return the correlations (n, n) of errors (c, n) about zero; of one that is 0, with none."""
+    unit = errors / np.where(errors.any(axis=0), np.linalg.norm(errors, axis=0), 1.0)
+    return np.where(np.eye(errors.shape[1], dtype=bool), 1.0, unit.T @ unit)
 
 
 def _kernel(logs: Any, x: Any, y: Any) -> jax.Array:
@@ -186,9 +204,13 @@ def _kernel(logs: Any, x: Any, y: Any) -> jax.Array:
     lengths = jnp.exp(logs[: x.shape[1]])
     a, b = x / lengths, y / lengths
     squared = jnp.sum(a**2, axis=1)[:, None] + jnp.sum(b**2, axis=1) - 2.0 * a @ b.T
+    return _bell(squared) + jnp.exp(logs[-2]) * (1.0 + x @ y.T)
+
+
+def _bell(squared: Any) -> jax.Array:
+    """Return Matern's correlation at a squared distance over the lengths."""
     rho = jnp.sqrt(5.0 * jnp.maximum(squared, 0.0) + 1e-12)
-    bell = (1.0 + rho + rho**2 / 3.0) * jnp.exp(-rho)
-    return bell + jnp.exp(logs[-2]) * (1.0 + x @ y.T)
+    return (1.0 + rho + rho**2 / 3.0) * jnp.exp(-rho)
 
 
 def _covariance(logs: Any, x: Any) -> jax.Array:
@@ -347,8 +369,11 @@ class RowsMap(OutputsMap):
         p = self.process
         x = (np.asarray(self.scene.to_unit(jnp.asarray(theta))) - p.centre) / p.width
         modes = p.modes[:, outputs]
+        correlated = p.correlations()
+        together = np.linalg.cholesky(correlated + _JITTER * np.eye(len(modes)))
         errors = rng.normal(size=(count, len(x), len(outputs))) * p.rest[outputs]
-        variances = np.tile(p.rest[outputs] ** 2, (len(x), 1))
+        normals = rng.normal(size=(count, len(x), len(modes))) @ together.T
+        roots = np.zeros((len(modes), len(x), len(x)))
         for k in np.flatnonzero(modes.any(axis=1)):
             logs = jnp.asarray(p.logs[k])
             regression = Regression.of(np.asarray(_covariance(logs, p.at)))
@@ -356,10 +381,12 @@ class RowsMap(OutputsMap):
             remaining = np.asarray(_covariance(logs, x)) - whitened.T @ whitened
             remaining *= p.variance[k]
             values, vectors = np.linalg.eigh(remaining)  # singular where two draws are one
-            root = vectors * np.sqrt(np.maximum(values, 0.0))
-            errors += (rng.normal(size=(count, len(x))) @ root.T)[..., None] * modes[k]
-            variances += np.maximum(np.diagonal(remaining), 0.0)[:, None] * modes[k] ** 2
-        return errors * p.sd[outputs], np.sqrt(variances) * p.sd[outputs]
+            # The symmetric root: signs of eigenvectors, of which each mode has others, cancel.
+            roots[k] = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+            errors += (normals[..., k] @ roots[k])[..., None] * modes[k]
+        between = correlated * np.einsum("kab,lab->akl", roots, roots, optimize=True)
+        variances = p.rest[outputs] ** 2 + np.einsum("kj,akj->aj", modes, between @ modes)
+        return errors * p.sd[outputs], np.sqrt(np.maximum(variances, 0.0)) * p.sd[outputs]
 
     def arrays(self) -> Arrays:
         """Return all that gives a value, by name."""

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 
 import calibrate as cal
 import emulator as em
@@ -252,8 +253,7 @@ def test_a_table_of_runs_is_a_posterior_with_a_verdict_and_the_next_runs(tmp_pat
         following = list(csv.DictReader(file))
     assert len(following) == 8
     assert all(1.0 <= float(row["stiffness"]) <= 5.0 for row in following)
-    noise = json.loads((tmp_path / "run" / "run.json").read_text())["noise"]
-    assert 0.05 < noise["force"] < 0.06
+    assert set(systematic_of(tmp_path / "run")) == {"emulator"}
     assert main(["report", str(tmp_path / "run")]) == 0
     capsys.readouterr()
     line = complaint(capsys, "init", tmp_path / "runs.csv", "--inputs", 3)
@@ -289,16 +289,42 @@ def test_moves_are_those_of_data_that_the_emulator_misses_by_as_much(tmp_path, c
     assert certificate.verdict == "not certified"
 
 
-def test_the_noise_has_the_errors_of_rows_left_out(tmp_path, capsys):
+def systematic_of(folder):
+    """The systematic errors of a run."""
+    return json.loads((folder / "run.json").read_text())["systematic"]
+
+
+def test_data_have_noise_and_the_covariance_of_errors_at_rows_left_out(tmp_path, capsys):
     main(["init", str(write_table(tmp_path)), "--inputs", "3"])
     capsys.readouterr()
     words = ["infer", tmp_path / "runs.toml", "--data", tmp_path / "data.csv", "--no-certify"]
-    words += ["--noise", "force=0.001", "volume=0.2", "--sampler", "laplace"]
+    words += ["--noise", "force=0.001", "volume=0.002", "--sampler", "laplace"]
+    main([*map(str, words), "--out", str(tmp_path / "run")])
+    _, posterior = read_posterior(tmp_path / "run")
+    errors = process_in(find_problem(str(tmp_path / "runs.toml"))).left_out
+    sizes = np.quantile(np.abs(errors), 0.9, axis=0) / 1.6449
+    shared = np.sum(errors[:, 0] * errors[:, 1]) / np.prod(np.linalg.norm(errors, axis=0))
+    covariance = np.diag([0.001**2, 0.002**2]) + np.outer(sizes, sizes) * [[1, shared], [shared, 1]]
+    model, draws = posterior.model, posterior.draws()
+    for k in (0, 100):
+        draw = {name: values[k] for name, values in draws.items()}
+        means, _ = model.predict(draw)
+        expected = multivariate_normal([means["force"], means["volume"]], covariance)
+        told = model.map_log_likelihood(draw, posterior.data)
+        assert float(told) == pytest.approx(expected.logpdf([0.85, 2.5]), abs=1e-6)
+
+
+def test_a_known_noise_is_widened_beside_one_that_is_inferred(tmp_path, capsys):
+    main(["init", str(write_table(tmp_path)), "--inputs", "3"])
+    capsys.readouterr()
+    words = ["infer", tmp_path / "runs.toml", "--data", tmp_path / "data.csv", "--no-certify"]
+    words += ["--noise", "force=0.001", "volume=gaussian:sd_scale=0.2", "--sampler", "laplace"]
     main([*map(str, words), "--out", str(tmp_path / "run")])
     noise = json.loads((tmp_path / "run" / "run.json").read_text())["noise"]
-    errors = np.sort(np.abs(process_in(find_problem(str(tmp_path / "runs.toml"))).left_out[:, 0]))
-    size = np.interp(0.9, np.linspace(0.0, 1.0, len(errors)), errors) / 1.6449
+    errors = np.abs(process_in(find_problem(str(tmp_path / "runs.toml"))).left_out[:, 0])
+    size = np.quantile(errors, 0.9) / 1.6449
     assert noise["force"] ** 2 == pytest.approx(0.001**2 + size**2, rel=1e-6)
+    assert not systematic_of(tmp_path / "run")
 
 
 def test_a_table_too_coarse_for_its_data_teaches_next_to_nothing(tmp_path, capsys):
@@ -312,8 +338,8 @@ def test_a_table_too_coarse_for_its_data_teaches_next_to_nothing(tmp_path, capsy
     capsys.readouterr()
     words = ["infer", tmp_path / "runs.toml", "--data", tmp_path / "data.csv", "--noise", "y=0.01"]
     code, told = answer(capsys, *words, *FEW, "--bounded", "a", "b", "--out", tmp_path / "run")
-    noise = json.loads((tmp_path / "run" / "run.json").read_text())["noise"]["y"]
-    assert noise > 0.3  # the emulator knows next to nothing, and says so
+    (modes,) = systematic_of(tmp_path / "run")["emulator"]["modes"]
+    assert np.linalg.norm(modes) > 0.3  # the emulator knows next to nothing, and says so
     assert code == 0
     assert all(row["sd"] > 0.75 / np.sqrt(12.0) for row in told["parameters"].values())
     assert (tmp_path / "run" / "next_runs.csv").is_file()

@@ -85,6 +85,14 @@ def test_a_gain_is_one_factor_of_all_data(model, data):
         np.testing.assert_array_equal(made.shares[name], np.full((1, 3, 3), 0.02))
 
 
+def test_modes_are_rows_over_all_numbers_of_their_observations(model, data):
+    rows = np.arange(36.0).reshape(2, 18)
+    made = of(model, data, kind="modes", of=f"{A}+{B}", modes=rows.tolist())
+    assert made.names == ("e 1", "e 2")
+    np.testing.assert_array_equal(made.modes[A], rows[:, :9].reshape(2, 3, 3))
+    np.testing.assert_array_equal(made.modes[B], rows[:, 9:].reshape(2, 3, 3))
+
+
 def test_missing_values_are_left_out_of_the_modes(model, data):
     gappy = {A: data[A].copy(), B: data[B]}
     gappy[A][1, 2] = np.nan
@@ -125,6 +133,9 @@ def test_data_may_be_as_far_off_as_the_errors_are(model):
         ({"kind": "placement", "of": A, "sd": 1.0, "rows": [3]}, "rows: there is no point 3"),
         ({"kind": "rigid_motion", "of": A, "turn": [1.0]}, "turn"),
         ({"kind": "rigid_motion", "of": A, "at": "sea"}, 'at = "sea"; expected "loaded" or "rest"'),
+        ({"kind": "modes", "of": A, "modes": [[1.0]]}, "a row has 1 numbers; displacement@a has 9"),
+        ({"kind": "modes", "of": A, "modes": []}, "modes: give one or more, of finite numbers"),
+        ({"kind": "modes", "of": A, "modes": [["x"]]}, "modes"),
         (
             {"kind": "curve", "of": A, "along": "mu", "length": 0.1},
             "of: 'displacement@a' is not a single number",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,7 +15,9 @@ POINTS = 6  # of a curve
 HEART = ("holzapfel_ogden_orthotropic", "holzapfel_ogden", "guccione")
 CLOT = ("ogden_1", "yeoh", "mooney_rivlin")
 MUSCLE = ("holzapfel_ogden_unswitched", "guccione", "yeoh")
-HEARTS, CLOTS = (4,), ("C10_T60_x", "C10_T120_y", "C40_T90_z")
+HEARTS = (1, 2, 3, 4, 5, 7, 8)
+CLOTS = tuple(f"C{c}_T{t}_{axis}" for c in (10, 40) for t in (60, 90, 120) for axis in "xyz")
+A_HEART, A_FEW_CLOTS = (4,), ("C10_T60_x", "C10_T120_y", "C40_T90_z")
 MODES = ("fs", "fn", "ff", "sf", "sn", "ss", "nf", "ns", "nn")
 """The normal of the glued faces, and the direction of motion, of a sheep's nine modes."""
 SIDE = 10.0  # mm of a clot
@@ -128,9 +130,9 @@ def humans(folder: Path) -> Iterator[Piece]:
     yield piece
 
 
-def sheep(folder: Path) -> Iterator[Piece]:
+def sheep(folder: Path, hearts: Sequence[int] = A_HEART) -> Iterator[Piece]:
     """Cubes of sheep's myocardium between glued plates, taken to deform evenly."""
-    for heart in HEARTS:
+    for heart in hearts:
         place = folder / "ovine_myocardium" / f"TSL{heart}"
         sizes = np.loadtxt(place / "WDH_Params.csv", delimiter=",").reshape(3, 3)
         piece = Piece("sheep, nine modes", f"TSL{heart}", HEART)
@@ -144,9 +146,9 @@ def sheep(folder: Path) -> Iterator[Piece]:
         yield piece
 
 
-def clots(folder: Path) -> Iterator[Piece]:
+def clots(folder: Path, names: Sequence[str] = A_FEW_CLOTS) -> Iterator[Piece]:
     """Blood clots in simple shear, with normal stress."""
-    for name in CLOTS:
+    for name in names:
         table = _numbers(folder / "blood_clots" / f"{name}.csv")
         amount, shear, normal = table[table[:, 0] > 0.0].T
         piece = Piece("clots, sheared", name, CLOT)
