@@ -318,7 +318,7 @@ def test_a_known_noise_is_widened_beside_one_that_is_inferred(tmp_path, capsys):
     main(["init", str(write_table(tmp_path)), "--inputs", "3"])
     capsys.readouterr()
     words = ["infer", tmp_path / "runs.toml", "--data", tmp_path / "data.csv", "--no-certify"]
-    words += ["--noise", "force=0.001", "volume=gaussian:sd_scale=0.2", "--sampler", "laplace"]
+    words += ["--noise", "force=0.001", "volume=gaussian:sd_scale=0.2", *FEW]
     main([*map(str, words), "--out", str(tmp_path / "run")])
     noise = json.loads((tmp_path / "run" / "run.json").read_text())["noise"]
     errors = np.abs(process_in(find_problem(str(tmp_path / "runs.toml"))).left_out[:, 0])
