@@ -1,12 +1,14 @@
 """Wheel and sdist away from the repository: ``python tests/package_check.py DIST``, by ``make package``.
 
 The wheel is installed into a new environment, with the versions of ``constraints.txt`` and none of
-the extras, and used from another folder. The tests of the package itself then run from the
-unpacked sdist. Nothing may come from the checkout.
+the extras, and used from another folder: the demo, and README's example in Python. The tests of the
+package itself then run from the unpacked sdist, and with the extra ``plot`` a report is made.
+Nothing may come from the checkout.
 """
 
 import fnmatch
 import os
+import re
 import subprocess
 import sys
 import tarfile
@@ -15,6 +17,7 @@ import tomllib
 import venv
 import zipfile
 from pathlib import Path
+from time import perf_counter
 
 ROOT = Path(__file__).resolve().parents[1]
 LARGEST = 12e6  # bytes of a wheel
@@ -52,6 +55,8 @@ def main(dist: Path) -> None:
         python = environment(folder / "bare", wheel)
         use_wheel(python, folder / "away")
         test_sdist(python, source)
+        install(python, f"{wheel}[plot]")
+        run([python.with_name("calibrate"), "report", "posterior"], folder / "away")
     print("wheel and sdist work away from the repository")
 
 
@@ -93,7 +98,9 @@ def environment(folder: Path, wheel: Path) -> Path:
 def install(python: Path, package: str) -> None:
     """Install into the environment of ``python``, at the versions that are known to work."""
     words = ["-m", "pip", "install", "--quiet", "--constraint", str(ROOT / "constraints.txt")]
+    began = perf_counter()
     subprocess.run([python, *words, package], check=True)
+    print(f"installed in {perf_counter() - began:.0f} s", flush=True)
 
 
 def use_wheel(python: Path, away: Path) -> None:
@@ -105,6 +112,8 @@ def use_wheel(python: Path, away: Path) -> None:
     run([calibrate, "demo", "--out", "posterior"], away)
     assert {path.name for path in (away / "posterior").iterdir()} >= {"posterior.nc", "run.json"}
     run([python, "-c", IMPORTS, str(ROOT)], away)
+    example = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    run([python, "-c", example[1]], away)
 
 
 def test_sdist(python: Path, source: Path) -> None:
@@ -118,7 +127,9 @@ def run(command: list[str | Path], folder: Path) -> None:
     """Run a command in ``folder`` that knows nothing of this process's environment."""
     print("$", *(word if "\n" not in str(word) else "..." for word in command[:4]), flush=True)
     kept = {name: os.environ[name] for name in ("PATH", "HOME", "LANG") if name in os.environ}
+    began = perf_counter()
     subprocess.run(command, cwd=folder, env=kept, check=True)
+    print(f"  {perf_counter() - began:.0f} s", flush=True)
 
 
 if __name__ == "__main__":
