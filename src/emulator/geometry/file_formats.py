@@ -30,10 +30,24 @@ from meshio.vtu import _vtu
 
 from emulator.core.errors import InputError
 from emulator.geometry.mesh import boundary_facets, find_rows
+from emulator.geometry.splitting import FACES
 
-# Corners of the faces of Abaqus's tetrahedra, and types of elements that meshio does not know.
-ABAQUS_FACES = {"S1": (0, 1, 2), "S2": (0, 3, 1), "S3": (1, 3, 2), "S4": (2, 3, 0)}
+ABAQUS_FACES = {4: ((0, 1, 2), (0, 3, 1), (1, 3, 2), (2, 3, 0)), **FACES}
+"""The corners of the faces S1, S2, ... of Abaqus's elements, by their number of corners."""
+ABAQUS_CORNERS = {4: 4, 10: 4, 6: 6, 8: 8}
+"""The number of corners of an element, by that of its nodes."""
+# Types of elements that meshio does not know.
 _TYPES = {"C3D4H": "tetra", "C3D4T": "tetra", "C3D10HS": "tetra10", "M3D3": "triangle"}
+
+
+def abaqus_face(word: str, nodes: int) -> tuple[int, ...]:
+    """Return the places of the corners of a face such as ``S1``; none where there is no such face.
+
+    nodes : the number of nodes of the element.
+    """
+    faces = ABAQUS_FACES.get(ABAQUS_CORNERS.get(nodes, 0), ())
+    number = int(word[1:]) if word[:1].upper() == "S" and word[1:].isdecimal() else 0
+    return faces[number - 1] if 1 <= number <= len(faces) else ()
 
 
 def read_cells(path: Path, reader: Callable[[Path], meshio.Mesh] | None = None) -> meshio.Mesh:
@@ -233,16 +247,16 @@ class _AbaqusPart:
                 self.unread[f"'{word}' in {self.names.get(name, name)}"] = None
         return of_set
 
-    def _triangles(self, name: str, corners: dict[str, list[str]]) -> dict[str, list[str]]:
+    def _faces(self, name: str, corners: dict[str, list[str]]) -> dict[str, list[str]]:
         """Return the nodes of the faces of a surface; ``corners`` has the nodes of each element."""
-        faces = {
-            f"{name} {k} {face}": [corners[k][c] for c in ABAQUS_FACES[face.upper()]]
-            for which, face in ((row[0], row[-1]) for row in self.sets["FACES"][name])
-            for k in self.numbers("ELSET", which.upper())
-            if face.upper() in ABAQUS_FACES and len(corners.get(k, ())) in (4, 10)
-        }
+        faces = {}
+        for which, face in ((row[0], row[-1]) for row in self.sets["FACES"][name]):
+            for k in self.numbers("ELSET", which.upper()):
+                places = abaqus_face(face, len(corners.get(k, ())))
+                if places:
+                    faces[f"{name} {k} {face}"] = [corners[k][c] for c in places]
         if not faces:
-            self.unread[f"surface {self.names[name]}, which has no faces S1 to S4"] = None
+            self.unread[f"surface {self.names[name]}, which has no faces of solids"] = None
         return faces
 
     def mesh(self) -> meshio.Mesh:
@@ -251,15 +265,17 @@ class _AbaqusPart:
         cells = {kind: dict(rows) for kind, rows in self.elements.items()}
         corners = {k: row for rows in self.elements.values() for k, row in rows.items()}
         for name in self.sets["FACES"]:
-            faces = self._triangles(name, corners)
-            cells.setdefault("triangle", {}).update(faces)
+            faces = self._faces(name, corners)
+            for key, row in faces.items():
+                cells.setdefault("quad" if len(row) == 4 else "triangle", {})[key] = row
             of_set[name] = [*of_set.get(name, ()), *faces]
         cells = {kind: rows for kind, rows in cells.items() if rows}
         place = {number: k for k, number in enumerate(self.nodes)}
         data = {}
         for name, members in of_set.items():
             masks = {kind: np.isin([*rows], members).astype(int) for kind, rows in cells.items()}
-            lower = any(m.any() for kind, m in masks.items() if kind.startswith(("tri", "line")))
+            flat = ("tri", "quad", "line")
+            lower = any(m.any() for kind, m in masks.items() if kind.startswith(flat))
             data[f"set:{self.names[name]}" if lower else self.names[name]] = [*masks.values()]
         return meshio.Mesh(
             np.array([[float(word or 0) for word in xyz[:3]] for xyz in self.nodes.values()]),

@@ -23,12 +23,14 @@ from emulator.geometry.fibres import across, from_elements, from_nodes
 from emulator.geometry.file_formats import MARK, TAG, Sets, read_cells, read_sets, tag_array, unused
 from emulator.geometry.mesh import Mesh, coincident, find_rows, orient
 from emulator.geometry.refinement import to_quadratic
+from emulator.geometry.splitting import as_tetrahedra
 
 # meshio's cells by the elements' order: (tetrahedron, triangle).
 _CELLS = {1: ("tetra", "triangle"), 2: ("tetra10", "triangle6")}
 _LOWER = {"triangle", "triangle6", "line", "line3", "vertex"}
 # VTK's numbers of cell types, and meshio's names.
-_VTK = {1: "vertex", 3: "line", 5: "triangle", 10: "tetra", 22: "triangle6", 24: "tetra10"}
+_VTK = {1: "vertex", 3: "line", 5: "triangle", 9: "quad", 10: "tetra", 12: "hexahedron",
+        13: "wedge", 14: "pyramid", 22: "triangle6", 24: "tetra10"}  # fmt: skip
 # Names of directions, in any case.
 _NAMES = {
     "fibres": r"(fib(er|re)?s?([ _-]?(dir|vec|orient|ax[ei]s|field)\w*)?|f[ _]?0)",
@@ -62,12 +64,13 @@ def read_mesh(source: str | Path | Any) -> Mesh:
     PyVista or a ``Mesh`` of meshio.
 
     Groups of triangles become facet sets and node sets, groups of lines and points node sets.
-    Nodes of no tetrahedron are dropped and inverted tetrahedra are turned.
+    Nodes of no tetrahedron are dropped and inverted tetrahedra are turned. Linear hexahedra, prisms
+    and pyramids are split (:mod:`emulator.geometry.splitting`).
 
     Raises
     ------
     InputError
-        Missing or unreadable file, cells other than tetrahedra, a group without a name, a group
+        Missing or unreadable file, other cells, a group without a name, a group
         off the surface, or a mesh :class:`Mesh` refuses.
     """
     with _content(source) as content:
@@ -237,7 +240,7 @@ def _content(source: str | Path | Any) -> Iterator[meshio.Mesh]:
     is_file = isinstance(source, str | Path)
     content = read_cells(Path(source)) if is_file else _as_meshio(source)
     try:
-        yield content
+        yield as_tetrahedra(content)
     except InputError as error:
         name = f"mesh file {source}" if is_file else f"mesh ({type(source).__name__})"
         raise InputError(f"{name}: {str(error).removeprefix('mesh: ')}") from error
@@ -319,8 +322,8 @@ def _tetrahedra(content: meshio.Mesh) -> str:
     solid = [kind for kind in kinds if kind in ("tetra", "tetra10")]
     if other := [kind for kind in kinds if kind not in (*solid, *_LOWER)]:
         raise InputError(
-            f"it has {', '.join(other)} cells; expected tetrahedra only (tetra or tetra10): "
-            "mesh or split the volume into them"
+            f"it has {', '.join(other)} cells; expected tetrahedra (tetra or tetra10), or linear "
+            "hexahedra, prisms and pyramids: mesh the volume with them"
         )
     if not solid:
         raise InputError(

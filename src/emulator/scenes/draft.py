@@ -115,7 +115,7 @@ def draft_scene(
     head = [
         f'law = "{material.name}"   # see docs/extending.md for others',
         f"mesh = {quoted(mesh_name)}",
-        *_elements(mesh),
+        *without_locking(mesh),
     ]
     if body.unused:
         unused = ", ".join(body.unused)
@@ -236,7 +236,7 @@ epicardium = {quoted(walls[1])}
 {axis}"""
 
 
-def _elements(mesh: Mesh) -> list[str]:
+def without_locking(mesh: Mesh) -> list[str]:
     """Return the lines that keep linear tetrahedra from locking."""
     if mesh.order == 2:
         return []

@@ -46,9 +46,9 @@ def test_bad_scene_files(capsys, block, old, new, message):
 def test_bad_meshes_in_scene_files(capsys, block):
     mesh = box((20.0, 10.0, 10.0), (2, 1, 1))
     solid = ("tetra", mesh.elements)
-    brick = ("hexahedron", [[0, 1, 4, 3, 6, 7, 10, 9]])
+    brick = ("hexahedron20", [[*range(12), *range(8)]])
     meshio.write(block.parent / "block.vtu", meshio.Mesh(mesh.nodes, [solid, brick]))
-    assert "it has hexahedron cells" in complaint(capsys, "simulate", block)
+    assert "it has hexahedron20 cells" in complaint(capsys, "simulate", block)
     tags = [np.zeros(len(mesh.elements), int), np.array([7, 8])]
     data = {"gmsh:physical": tags, "gmsh:geometrical": tags}
     cells = [solid, ("triangle", mesh.surface[:2])]

@@ -205,7 +205,7 @@ def test_sets_and_surfaces_of_abaqus(tmp_path, mesh):
     assert set(body.mesh.node_sets["load"]) == set(left - 11)
     np.testing.assert_array_equal(body.mesh.node_set("wire"), np.sort(left[:2]) - 11)
     assert "'nobody' in again" in body.unused
-    assert "surface empty, which has no faces S1 to S4" in body.unused
+    assert "surface empty, which has no faces of solids" in body.unused
     assert "set nodes_of_half, which has no members of its own" in body.unused
     assert 'half (regions = "half")' in body.unused
     assert read_regions(tmp_path / "block.inp", "half").sum() == 24

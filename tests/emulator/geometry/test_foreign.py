@@ -72,8 +72,8 @@ def test_what_is_refused(block):
     with pytest.raises(InputError, match="a scikit-fem MeshHex1 has no tetrahedra"):
         em.read_mesh(MeshHex())
     grid = grid_of(em.read_mesh(block))
-    grid.celltypes = np.array([12])
-    with pytest.raises(InputError, match=r"VTK's type 12; expected tetrahedra only"):
+    grid.celltypes = np.array([25])
+    with pytest.raises(InputError, match=r"VTK's type 25; expected tetrahedra only"):
         em.read_mesh(grid)
     only_triangles = meshio.Mesh(np.eye(3), [("triangle", [[0, 1, 2]])])
     with pytest.raises(InputError, match=r"mesh \(Mesh\): it has no tetrahedra"):

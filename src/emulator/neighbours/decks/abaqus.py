@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 
 from emulator.core.errors import InputError
-from emulator.geometry.file_formats import ABAQUS_FACES
 from emulator.mechanics.laws import find_law
 from emulator.neighbours.decks import materials
 from emulator.neighbours.decks.deck import (
@@ -99,8 +98,8 @@ class _AbaqusReading:
                 self._read_condition(block, line, [*row, "", "", "", ""], scale, material)
         body = self.body
         axes = self._axes(material)
-        mesh = assemble(self.file, body.nodes, body.elements, body.node_sets, body.facet_sets)
-        return finished("Abaqus", self.file, mesh, material, self.prescribed, self.loads, axes)
+        whole = assemble(self.file, body.nodes, body.elements, body.node_sets, body.facet_sets)
+        return finished("Abaqus", self.file, whole, material, self.prescribed, self.loads, axes)
 
     # Material.
 
@@ -304,11 +303,11 @@ class _AbaqusReading:
         value = scale * self.file.numbers(row[2:3] if kind[:1] == "P" else ["0"], line, 1)[0]
         if block.keyword == "DSLOAD" and kind == "P":
             self.loads.append(pressure(self.body.surface(row[0], line), value))
-        elif block.keyword == "DLOAD" and kind[:1] == "P" and face in ABAQUS_FACES:
+        elif block.keyword == "DLOAD" and kind[:1] == "P" and face[1:].isdecimal():
             # Decks list faces one by one: those of one pressure are one surface.
             name = f"{row[2]} of line {block.line}"
             facets = self.body.facets("", [(line, [row[0], face])])
-            if name not in self.body.facet_sets:
+            if facets and name not in self.body.facet_sets:
                 self.loads.append(pressure(name, value))
             self.body.facet_sets.setdefault(name, []).extend(facets)
         else:

@@ -15,6 +15,7 @@ import numpy as np
 
 from emulator.core.errors import InputError, closest
 from emulator.geometry.mesh import Mesh, coincident, find_rows, orient
+from emulator.geometry.splitting import FACES, tetrahedra_of, triangles_of
 from emulator.mechanics.laws import LAWS
 from emulator.neighbours.decks.materials import Material
 from emulator.scenes.loads import Force, Gravity
@@ -26,6 +27,7 @@ AXES = "xyz"
 _STANDARD = 9.81  # m/s2 of the weight's acceleration; the density makes up for it
 _KPA_PER_MM = 1.0e-3  # of 1 g/cm3 under 1 m/s2
 _MOST_KEYS = 10_000_000  # numbers of one line of a set
+_QUADRATIC, _QUADRILATERAL = 10, 4  # nodes of an element, and of a facet
 _MOST_POINTS = 50  # nodes of one load, each of which gets a force by itself
 
 
@@ -40,6 +42,7 @@ class Deck:
     material : the law and its parameters.
     supports, loads : those that the scene gets.
     fibres, sheets : unit vectors (m, 3), one an element, or None.
+    is_split : whether elements of the deck were split into tetrahedra.
     unread : a sentence for each line that was not understood.
     notes : sentences on equations that differ.
     """
@@ -51,6 +54,7 @@ class Deck:
     loads: tuple[Load, ...]
     fibres: np.ndarray | None
     sheets: np.ndarray | None
+    is_split: bool
     unread: tuple[str, ...]
     notes: tuple[str, ...]
 
@@ -137,8 +141,15 @@ class DeckFile:
         return path
 
 
+class Assembled(NamedTuple):
+    """The mesh of a deck, and of each of its elements the row (m,) of the deck's element."""
+
+    mesh: Mesh
+    parents: np.ndarray
+
+
 def finished(
-    program: str, file: DeckFile, mesh: Mesh, material: Material,
+    program: str, file: DeckFile, body: Assembled, material: Material,
     prescribed: Mapping[tuple[str, int], float], loads: Iterable[Load],
     axes: tuple[np.ndarray | None, np.ndarray | None], springs: Iterable[BoundaryCondition] = (),
 ) -> Deck:  # fmt: skip
@@ -148,7 +159,13 @@ def finished(
         values.setdefault(name, {})[axis] = value
     supports = (*(support(name, of_set) for name, of_set in values.items()), *springs)
     unread = tuple(f"line {line} is not understood: {text}" for line, text in sorted(file.unread))
-    return Deck(program, mesh, material, supports, tuple(loads), *axes, unread, tuple(file.notes))
+    mesh, parents = body
+    fibres, sheets = (None if rows is None else rows[parents] for rows in axes)
+    is_split = len(np.unique(parents)) < len(parents)
+    notes = tuple(file.notes)
+    return Deck(
+        program, mesh, material, supports, tuple(loads), fibres, sheets, is_split, unread, notes
+    )
 
 
 def read_text(path: Path) -> str:
@@ -162,7 +179,7 @@ def read_text(path: Path) -> str:
 
 
 class Element(NamedTuple):
-    """The nodes of a tetrahedron, and its line in the deck."""
+    """The nodes of an element, and its line in the deck."""
 
     nodes: tuple[Any, ...]
     line: int
@@ -178,28 +195,29 @@ def assemble[K: Hashable](
     elements: Mapping[K, Element],
     node_sets: Mapping[str, Iterable[K]],
     facet_sets: Mapping[str, Sequence[Row]],
-) -> Mesh:
-    """Return the mesh; nodes of no element are dropped.
+) -> Assembled:
+    """Return the mesh; nodes of no element are dropped, other cells than tetrahedra are split.
 
     Parameters
     ----------
     nodes : coordinates by the deck's number.
-    elements : the tetrahedra, all of 4 or all of 10 nodes.
+    elements : tetrahedra of 10 nodes; or those of 4, prisms of 6 and hexahedra of 8 nodes.
     node_sets : the numbers of the nodes of each set.
     facet_sets : the corners of the facets of each set.
     """
     if not elements:
-        raise InputError(f"deck {file.path}: it has no tetrahedra (tet4 or tet10)")
-    width = len(next(iter(elements.values())).nodes)
+        raise InputError(f"deck {file.path}: it has no elements")
+    are_linear = len(next(iter(elements.values())).nodes) < _QUADRATIC
     for number, (corners, line) in elements.items():
-        if len(corners) != width:
-            raise file.error(line, "elements of 4 and of 10 nodes; expected one of the two")
+        if (len(corners) < _QUADRATIC) != are_linear:
+            raise file.error(line, "linear and quadratic elements; expected one of the two")
         if absent := [k for k in corners if k not in nodes]:
             raise file.error(line, f"element {_shown(number)} has no node {_shown(absent[0])}")
     used = dict.fromkeys(k for element in elements.values() for k in element.nodes)
     places = {number: k for k, number in enumerate(k for k in nodes if k in used)}
     points = np.array([nodes[k] for k in places], dtype=float)
-    rows = orient(points, np.array([[places[k] for k in e.nodes] for e in elements.values()]))
+    split, parents = _tetrahedra([[places[k] for k in e.nodes] for e in elements.values()])
+    rows = orient(points, split)
     kept = {name: [places[k] for k in keys if k in places] for name, keys in node_sets.items()}
     try:
         bare = Mesh(points, rows, {name: np.unique(k) for name, k in kept.items() if k})
@@ -218,17 +236,37 @@ def assemble[K: Hashable](
             f"deck {file.path}: nodes {_shown(one)} and {_shown(other)} are at the same place, "
             f"{len(pairs)} such pairs, so that what touches there is not joined; merge them"
         )
-    return mesh
+    return Assembled(mesh, parents)
+
+
+def _tetrahedra(cells: Sequence[Sequence[int]]) -> tuple[np.ndarray, np.ndarray]:
+    """Return tetrahedra (t, 4 or 10), and the place (t,) among ``cells`` of the cell of each."""
+    widths = np.array([len(cell) for cell in cells])
+    rows, parents = [], []
+    for width in np.unique(widths).tolist():
+        numbers = np.flatnonzero(widths == width)
+        of_width, of = np.array([cells[k] for k in numbers.tolist()]), np.arange(len(numbers))
+        if width in FACES:
+            of_width, of = tetrahedra_of(of_width)
+        rows.append(of_width)
+        parents.append(numbers[of])
+    order = np.argsort(np.concatenate(parents), kind="stable")
+    return np.concatenate(rows)[order], np.concatenate(parents)[order]
 
 
 def _on_surface(
     mesh: Mesh, name: str, corners: Sequence[Row], places: Mapping[Any, int]
 ) -> np.ndarray:
-    rows = np.array([[places.get(k, -1) for k in row[:3]] for row in corners], dtype=int)
+    whole = [row for row in corners if len(row) != _QUADRILATERAL]
+    fours = [row for row in corners if len(row) == _QUADRILATERAL]
+    corners = [*whole, *(row for row in fours for _ in range(2))]
+    numbers = np.array([[places.get(k, -1) for k in row] for row in fours], dtype=int)
+    rows = np.array([[places.get(k, -1) for k in row[:3]] for row in whole], dtype=int)
+    rows = np.concatenate([rows.reshape(-1, 3), triangles_of(numbers.reshape(-1, 4))])
     hits = find_rows(rows, mesh.surface[:, :3])
     if (hits < 0).any():
-        row = ", ".join(map(_shown, corners[int(np.argmax(hits < 0))][:3]))
-        raise InputError(f"facet {row} of '{name}' is not on the surface of the tetrahedra")
+        row = ", ".join(map(_shown, corners[int(np.argmax(hits < 0))][:_QUADRILATERAL]))
+        raise InputError(f"facet {row} of '{name}' is not on the surface of the body")
     return mesh.surface[np.unique(hits)]
 
 

@@ -26,7 +26,7 @@ from emulator.neighbours.decks.abaqus import read_abaqus
 from emulator.neighbours.decks.deck import Deck, DeckFile
 from emulator.neighbours.decks.febio import read_febio
 from emulator.neighbours.decks.svmultiphysics import ROOTS, read_svmultiphysics
-from emulator.scenes.draft import guessed_unit, quoted
+from emulator.scenes.draft import guessed_unit, quoted, without_locking
 from emulator.scenes.file import read_scene
 from emulator.scenes.part import Part
 from emulator.scenes.scene import Scene, with_mesh
@@ -108,7 +108,9 @@ def draft_deck(path: Path, out: Path, unit: str | None = None) -> DeckDraft:
         notes.insert(
             1, f"stresses are taken to be kPa; if they are in MPa, give --unit {length},MPa"
         )
-    if deck.mesh.order == 1:
+    if deck.is_split:
+        notes.append("the deck's hexahedra and prisms are split into tetrahedra: other elements")
+    elif deck.mesh.order == 1:
         notes.append("the elements are the deck's linear tetrahedra, which lock; see order")
     mesh = replace(deck.mesh, nodes=IN_MM[length] * deck.mesh.nodes)
     text = _scene(deck, path, mesh_path.name, IN_MM[length], IN_KPA[stress])
@@ -158,7 +160,9 @@ def _scene(deck: Deck, path: Path, mesh_name: str, length: float, stress: float)
     """Return the entries of the scene file."""
     law = find_law(deck.material.law)
     head = [f'law = "{law.name}"', f"mesh = {quoted(mesh_name)}"]
-    if deck.mesh.order == 1:
+    if deck.is_split:
+        head += without_locking(deck.mesh)
+    elif deck.mesh.order == 1:
         head.append("# order = 2   # quadratic elements, which do not lock")
     sections = ["\n".join(head)]
     for array, entries in (("supports", deck.supports), ("loads", deck.loads)):

@@ -31,7 +31,7 @@ from emulator.scenes.loads import DeadPressure, FollowerPressure, Traction
 from emulator.scenes.part import Load
 
 _VERSIONS = ("2.5", "3.0", "4.0")
-_WIDTHS = {"tet4": 4, "tet10": 10}
+_WIDTHS = {"tet4": 4, "tet10": 10, "penta6": 6, "hex8": 8}
 _SETTINGS = {
     "Module", "Control", "Globals", "Output", "LoadData", "Geometry", "Mesh", "MeshDomains",
     "MeshData", "Material", "Step", "step",
@@ -72,7 +72,7 @@ class _FebioReading:
     """The tables of a deck that is being read.
 
     nodes : coordinates by number.
-    elements : tetrahedra by number.
+    elements : elements by number.
     blocks : the numbers of the elements of each block, by its name.
     used : the line that names each material, by number or name.
     end : the time at which load curves are read; None for that of their last points.
@@ -118,8 +118,8 @@ class _FebioReading:
                 if not done:
                     self.file.skip(child.line, f"{child.described()} in {tag.name}")
         axes = self._axes()
-        mesh = assemble(self.file, self.nodes, self.elements, self.node_sets, self.facet_sets)
-        return finished("FEBio", self.file, mesh, material, self.prescribed, self.loads, axes)
+        body = assemble(self.file, self.nodes, self.elements, self.node_sets, self.facet_sets)
+        return finished("FEBio", self.file, body, material, self.prescribed, self.loads, axes)
 
     # Mesh.
 
@@ -137,8 +137,9 @@ class _FebioReading:
                 self.node_sets[name] = self._read_node_set(tag)
             elif tag.name == "Surface":
                 for facet in tag.children:
-                    if facet.name not in ("tri3", "tri6"):
-                        raise self.file.error(facet.line, f"{facet.name}; expected triangles")
+                    if facet.name not in ("tri3", "tri6", "quad4"):
+                        what = f"{facet.name}; expected triangles or quad4"
+                        raise self.file.error(facet.line, what)
                 self.facet_sets[name] = [self._keys(facet) for facet in tag.children]
             elif tag.name != "ElementSet":
                 self.file.skip(tag.line, f"{tag.described()} in {mesh.name}")
@@ -147,8 +148,8 @@ class _FebioReading:
         width = _WIDTHS.get(kind := tag.attributes.get("type", ""))
         if width is None:
             raise self.file.error(
-                tag.line, f"elements '{kind}'; expected tetrahedra only (tet4 or tet10): mesh or "
-                "split the volume into them",
+                tag.line, f"elements '{kind}'; expected tetrahedra (tet4 or tet10), penta6 or "
+                "hex8: mesh the volume with them",
             )  # fmt: skip
         block = self.blocks.setdefault(tag.attributes.get("name", ""), [])
         for element in tag.children:

@@ -11,12 +11,13 @@ from functools import cached_property
 
 import numpy as np
 
-from emulator.geometry.file_formats import ABAQUS_FACES
+from emulator.geometry.file_formats import abaqus_face
 from emulator.neighbours.decks.deck import DeckFile, Element, Row
 from emulator.neighbours.decks.keywords import Block
 
 WIDTHS = {"C3D4": 4, "C3D4H": 4, "C3D10": 10, "C3D10H": 10, "C3D10M": 10, "C3D10HS": 10,
-          "C3D10MH": 10}  # fmt: skip
+          "C3D10MH": 10, "C3D6": 6, "C3D6H": 6, "C3D8": 8, "C3D8H": 8, "C3D8I": 8, "C3D8R": 8,
+          "C3D8RH": 8}  # fmt: skip
 Key = tuple[str, int]
 """The instance and the number of a node or an element; the instance of a flat deck is empty."""
 
@@ -92,8 +93,8 @@ class Instances:
         width = WIDTHS.get(kind := block.options.get("TYPE", "").upper())
         if width is None:
             raise self.file.error(
-                block.line, f"elements '{kind}'; expected tetrahedra only (C3D4 or C3D10): mesh or "
-                "split the volume into them",
+                block.line, f"elements '{kind}'; expected tetrahedra (C3D4 or C3D10), prisms "
+                "(C3D6) or hexahedra (C3D8): mesh the volume with them",
             )  # fmt: skip
         words, numbers = list[str](), list[str]()
         for line, row in block.numbered():
@@ -229,16 +230,17 @@ class Instances:
         return members
 
     def facets(self, owner: str, rows: Iterable[tuple[int, list[str]]]) -> list[Row]:
-        """Return the corners of faces S1 to S4 of elements."""
+        """Return the corners of faces S1, S2, ... of elements."""
         facets: list[Row] = []
         for line, row in rows:
-            corners = ABAQUS_FACES.get(row[1].upper() if len(row) > 1 else "")
-            if corners is None:
-                self.file.skip(line, f"{', '.join(row)} of a surface, no face S1 to S4")
-                continue
+            word, of_row = row[1] if len(row) > 1 else "", list[Row]()
             for key in self.elements_of(owner, row[0], line):
                 nodes = self.elements[key].nodes
-                facets.append(tuple(nodes[c] for c in corners))
+                of_row.append(tuple(nodes[c] for c in abaqus_face(word, len(nodes))))
+            if not all(of_row):
+                self.file.skip(line, f"{', '.join(row)} of a surface, no face of a solid")
+                continue
+            facets += of_row
         return facets
 
     def surface(self, word: str, line: int) -> str:

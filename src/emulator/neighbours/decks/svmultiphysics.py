@@ -12,7 +12,16 @@ from scipy.spatial import cKDTree
 from emulator.geometry.file_formats import read_cells
 from emulator.geometry.io import read_body, read_mesh
 from emulator.geometry.mesh import Mesh, find_rows
-from emulator.neighbours.decks.deck import AXES, Deck, DeckFile, finished, only_material, weight
+from emulator.geometry.splitting import triangles_of
+from emulator.neighbours.decks.deck import (
+    AXES,
+    Assembled,
+    Deck,
+    DeckFile,
+    finished,
+    only_material,
+    weight,
+)
 from emulator.neighbours.decks.materials import OTHER, QUADRATIC, Material, split_neo_hookean
 from emulator.neighbours.decks.tags import Tag, number, read_tags
 from emulator.scenes.loads import DeadPressure, FollowerPressure
@@ -66,7 +75,8 @@ def read_svmultiphysics(file: DeckFile) -> Deck:
         if tag.name not in _SETTINGS:
             file.skip(tag.line, f"{tag.described()} in Add_equation")
     axes = fibres, sheets
-    return finished("svMultiPhysics", file, mesh, material, prescribed, loads, axes, springs)
+    body = Assembled(mesh, np.arange(len(mesh.elements)))
+    return finished("svMultiPhysics", file, body, material, prescribed, loads, axes, springs)
 
 
 def _mesh(file: DeckFile, tag: Tag) -> tuple[Mesh, np.ndarray | None, np.ndarray | None]:
@@ -83,8 +93,9 @@ def _mesh(file: DeckFile, tag: Tag) -> tuple[Mesh, np.ndarray | None, np.ndarray
             continue
         content = read_cells(file.neighbour(where.text, where.line))
         away, near = tree.query(np.asarray(content.points, dtype=float))
-        rows = [b.data[:, :3] for b in content.cells if b.type.startswith("triangle")]
-        corners = near[np.concatenate(rows)] if rows else np.empty((0, 3), int)
+        rows = [near[b.data[:, :3]] for b in content.cells if b.type.startswith("triangle")]
+        rows += [triangles_of(near[b.data]) for b in content.cells if b.type == "quad"]
+        corners = np.concatenate(rows) if rows else np.empty((0, 3), int)
         hits = find_rows(corners, mesh.surface[:, :3])
         if not len(hits) or (hits < 0).any() or away.max() > _NEAR * mesh.size:
             raise file.error(where.line, f"face '{where.text}' is not on the surface of the mesh")

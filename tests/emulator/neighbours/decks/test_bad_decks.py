@@ -45,8 +45,9 @@ INP = abaqus("*Hyperelastic, neo hooke\n2.0, 0.025", abaqus_supports())
         (DECK.replace('Module type="solid"', 'Module type="biphasic"'), "module 'biphasic'; only"),
         (DECK.replace('node_set="left"', 'node_set="lft"'), "node set 'lft' is not in the deck; "),
         (DECK.replace('surface="right"', 'surface="rigth"'), "; did you mean 'right'?"),
-        (DECK.replace('"tet4"', '"hex8"'), "elements 'hex8'; expected tetrahedra only"),
-        (DECK.replace('"tet4"', '"tet4x"'), "elements 'tet4x'; expected tetrahedra only"),
+        (DECK.replace('"tet4"', '"hex20"'), "elements 'hex20'; expected tetrahedra (tet4 or"),
+        (DECK.replace('"tet4"', '"hex8"'), "4 nodes; a hex8 has 8"),
+        (DECK.replace("tri3", "quad8"), "quad8; expected triangles or quad4"),
         (DECK.replace('"tet4"', '"tet10"'), "4 nodes; a tet10 has 10"),
         (DECK.replace('<node id="2">1.0,', '<node id="2">one,'), "line 9: 'one' is not a number"),
         (DECK.replace('<node id="2">1.0,', '<node id="2">'), "2 numbers, expected 3 finite ones"),
@@ -78,7 +79,7 @@ def test_a_deck_of_febio_is_refused(tmp_path, text, message):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("C3D4", "C3D8", "elements 'C3D8'; expected tetrahedra only (C3D4 or C3D10)"),
+        ("C3D4", "C3D20", "elements 'C3D20'; expected tetrahedra (C3D4 or C3D10), prisms"),
         ("2, 1.0,", "2, one,", "line 5: 'one' is not a number"),
         ("\n3, ", "\n2, ", "line 6: node 2 is there before"),
         ("left, 1,", "lft, 1,", "node set 'lft' is not in the deck; it has left, right"),
