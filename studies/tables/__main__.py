@@ -13,9 +13,10 @@ Writes results.json after each table, and tables.png.
 import csv
 import os
 import tempfile
+from functools import cache
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -95,39 +96,49 @@ def beside(python: str, x: np.ndarray, y: np.ndarray, apart: np.ndarray, truth: 
     }
 
 
-def case(x: np.ndarray, y: np.ndarray, python: str | None) -> Case:
-    """Errors of outputs of rows kept apart, and coverage of the inputs of some of them."""
+class Table(NamedTuple):
+    """A table, and the posterior that its rows give of the first row that is kept apart.
+
+    x, y : inputs (c, p) and outputs (c, n). known, apart : the rows of each kind.
+    data : the outputs of the rows kept apart, with noise.
+    posterior : of the first of them. seconds : what it took, with all fits.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    known: np.ndarray
+    apart: np.ndarray
+    data: np.ndarray
+    posterior: cal.Posterior
+    seconds: float
+
+
+@cache
+def fitted(folder: Path | None) -> Table:
+    """The table in a folder, or the one made here, with its first posterior."""
+    x, y = made() if folder is None else read(folder)
     order = np.random.default_rng(SEED).permutation(len(x))
     apart, known = order[: len(x) // HELD_OUT], order[len(x) // HELD_OUT :]
     inside = ((x[apart] >= x[known].min(axis=0)) & (x[apart] <= x[known].max(axis=0))).all(axis=1)
     apart = apart[inside]  # the map answers nowhere else
     rng = np.random.default_rng([SEED, 1])
     data = y[apart] + NOISE * y[known].std(axis=0) * rng.normal(size=y[apart].shape)
-    with tempfile.TemporaryDirectory() as folder:
-        path = write(Path(folder), x[known], y[known], data[0])
+    with tempfile.TemporaryDirectory() as place:
+        path = write(Path(place), x[known], y[known], data[0])
         begin = perf_counter()
         posterior = cal.infer(cal.read_experiment(path))
         seconds = perf_counter() - begin
-        full: Any = posterior.model.full  # a process of rows, which knows its errors
-        predicted = np.asarray(jax.vmap(full)(jnp.asarray(x[apart])))[..., 0]
-        _, sds = full.drawn_errors(x[apart], np.arange(y.shape[1]), 1, rng)
-        found = [posterior.draws()]
-        names = posterior.model.observe.parts
-        count = -(-LEAST_INFERRED // x.shape[1])
-        begin = perf_counter()
-        for row in data[1:count]:
-            values = dict(zip(names, row, strict=True))
-            further = cal.sample(posterior.model, values, sampler="nuts", options=OPTIONS)
-            found.append(further.draws())
-        each = (perf_counter() - begin) / (count - 1)
+    return Table(x, y, known, apart, data, posterior, seconds)
+
+
+def outputs(table: Table, python: str | None) -> Case:
+    """Errors of the outputs of rows kept apart, and AutoEmulate's."""
+    x, y, known, apart, _, posterior, seconds = table
+    full: Any = posterior.model.full  # a process of rows, which knows its errors
+    predicted = np.asarray(jax.vmap(full)(jnp.asarray(x[apart])))[..., 0]
+    rng = np.random.default_rng([SEED, 2])
+    _, sds = full.drawn_errors(x[apart], np.arange(y.shape[1]), 1, rng)
     errors, r2 = predicted - y[apart], r2_of(predicted, y[apart])
-    ranks = np.array(
-        [
-            np.mean(draws[f"x{k}"] < x[row, k])
-            for row, draws in zip(apart[:count], found, strict=True)
-            for k in range(x.shape[1])
-        ]
-    )
     peer = {}
     if python is not None:
         peer = {"AutoEmulate": beside(python, x[known], y[known], x[apart], y[apart])}
@@ -140,9 +151,30 @@ def case(x: np.ndarray, y: np.ndarray, python: str | None) -> Case:
         "r2_least": float(r2.min()),
         "inside_90": float((np.abs(errors) < 1.645 * sds).mean()),
         "seconds_to_first_posterior": seconds,
-        "posteriors": len(found),
-        "seconds_a_further_posterior": each,
-        "inputs_inside_90": float(((ranks > 0.05) & (ranks < 0.95)).mean()),
+    }
+
+
+def inputs(table: Table) -> Case:
+    """Coverage of the inputs of some rows kept apart, from their outputs with noise."""
+    posterior, count = table.posterior, -(-LEAST_INFERRED // table.x.shape[1])
+    of_rows, begin = [posterior.draws()], perf_counter()
+    for row in table.data[1:count]:
+        values = dict(zip(posterior.model.observe.parts, row, strict=True))
+        further = cal.sample(posterior.model, values, sampler="nuts", options=OPTIONS)
+        of_rows.append(further.draws())
+    ranks = np.array(
+        [
+            np.mean(draws[f"x{k}"] < table.x[row, k])
+            for row, draws in zip(table.apart[:count], of_rows, strict=True)
+            for k in range(table.x.shape[1])
+        ]
+    )
+    return {
+        "posteriors": count,
+        "inferred": len(ranks),
+        "inside_90": float(((ranks > 0.05) & (ranks < 0.95)).mean()),
+        "inside_50": float(((ranks > 0.25) & (ranks < 0.75)).mean()),
+        "seconds_a_further_posterior": (perf_counter() - begin) / (count - 1),
     }
 
 
@@ -176,13 +208,12 @@ def main() -> None:
     results = Results(arguments.out, SEED, again=arguments.again)
     found = [] if arguments.data is None else arguments.data.glob("cardiac*/processed/outputs.csv")
     tables = {path.parts[-3]: path.parent for path in sorted(found, reverse=True)}  # small first
-    if not tables or arguments.quick:
-        results.case("made", lambda: case(*made(), arguments.peers))
-    for name, folder in {} if arguments.quick else tables.items():
-        x, y = read(folder)
-        results.case(name, lambda x=x, y=y: case(x, y, arguments.peers))
+    every: dict[str, Path | None] = {"made": None} if not tables or arguments.quick else {**tables}
+    for name, folder in every.items():
+        results.case(name, lambda folder=folder: outputs(fitted(folder), arguments.peers))
+        results.case(f"{name}, inputs", lambda folder=folder: inputs(fitted(folder)))
     results.write()
-    draw(results.cases, arguments.out / "tables.png")
+    draw([done for done in results.cases if "r2" in done], arguments.out / "tables.png")
     for done in results.cases:
         assert done["inside_90"] > 0.8, done["name"]
 
