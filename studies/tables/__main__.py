@@ -156,7 +156,8 @@ def outputs(table: Table, python: str | None) -> Case:
 
 def inputs(table: Table) -> Case:
     """Coverage of the inputs of some rows kept apart, from their outputs with noise."""
-    posterior, count = table.posterior, -(-LEAST_INFERRED // table.x.shape[1])
+    posterior = table.posterior
+    count = min(-(-LEAST_INFERRED // table.x.shape[1]), len(table.data))
     of_rows, begin = [posterior.draws()], perf_counter()
     for row in table.data[1:count]:
         values = dict(zip(posterior.model.observe.parts, row, strict=True))
