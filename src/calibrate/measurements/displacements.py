@@ -26,13 +26,19 @@ from calibrate.measurements.points import XYZ, DisplacementPoints, as_points, ga
 from calibrate.measurements.words import names_of
 from emulator.core.errors import InputError
 from emulator.geometry.discretisation import shapes_at
+from emulator.scenes.forward_problem import ForwardProblem
 from emulator.scenes.scene import Scene, all_nodes, check_nodes
 
 _SHORTEST = 1e-6  # in sizes of the body; the direction of a shorter length is round-off
 
 
-def spread_nodes(scene: Scene, count: int, seed: int) -> np.ndarray:
+def spread_nodes(scene: ForwardProblem, count: int, seed: int) -> np.ndarray:
     """Return ``count`` nodes drawn without replacement from those with a free component, sorted."""
+    if not isinstance(scene, Scene):
+        raise InputError(
+            f"observe nodes: '{scene.name}' has no mesh; give --data FILE, or --observe NAMES of "
+            "what it has, as stress"
+        )
     candidates = np.flatnonzero(~scene.held.all(axis=1))
     if not 0 < count <= len(candidates):
         raise InputError(

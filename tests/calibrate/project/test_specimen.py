@@ -89,6 +89,13 @@ def test_a_specimen_is_simulated_state_by_state(tmp_path, monkeypatch, capsys):
     np.testing.assert_allclose(P[:, :2], data, atol=0.02 * data.max())  # kappa is finite
     assert main([*words, "--out", "test.vtu"]) == 2
     assert "is a specimen, which has no mesh" in capsys.readouterr().err
+    for words in (
+        ["infer", "test_scene.toml", "--out", "run"],
+        ["identify", "before", "test_scene.toml"],
+    ):
+        assert main(words) == 2
+        line = capsys.readouterr().err
+        assert line.startswith("calibrate: observe nodes: 'test_scene' has no mesh; give --data")
 
 
 @pytest.mark.parametrize(
