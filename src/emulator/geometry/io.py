@@ -23,7 +23,7 @@ from emulator.geometry.fibres import across, from_elements, from_nodes
 from emulator.geometry.file_formats import MARK, TAG, Sets, read_cells, read_sets, tag_array, unused
 from emulator.geometry.mesh import Mesh, coincident, find_rows, orient
 from emulator.geometry.refinement import to_quadratic
-from emulator.geometry.splitting import as_tetrahedra
+from emulator.geometry.splitting import SPLIT, as_tetrahedra
 
 # meshio's cells by the elements' order: (tetrahedron, triangle).
 _CELLS = {1: ("tetra", "triangle"), 2: ("tetra10", "triangle6")}
@@ -240,7 +240,8 @@ def _content(source: str | Path | Any) -> Iterator[meshio.Mesh]:
     is_file = isinstance(source, str | Path)
     content = read_cells(Path(source)) if is_file else _as_meshio(source)
     try:
-        yield as_tetrahedra(content)
+        others = not SPLIT.isdisjoint(block.type for block in content.cells)
+        yield as_tetrahedra(content) if others else content
     except InputError as error:
         name = f"mesh file {source}" if is_file else f"mesh ({type(source).__name__})"
         raise InputError(f"{name}: {str(error).removeprefix('mesh: ')}") from error

@@ -21,7 +21,8 @@ FACES = {
     8: ((0, 1, 2, 3), (4, 7, 6, 5), (0, 4, 5, 1), (1, 5, 6, 2), (2, 6, 7, 3), (3, 7, 4, 0)),
 }
 """The corners of the faces of a cell, by its number of corners, in the order of Abaqus's faces."""
-_SOLID = {"pyramid": 5, "wedge": 6, "hexahedron": 8}
+SPLIT = frozenset({"pyramid", "wedge", "hexahedron"})
+"""meshio's names of the cells that are split."""
 
 
 def triangles_of(quadrilaterals: np.ndarray) -> np.ndarray:
@@ -53,13 +54,11 @@ def tetrahedra_of(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def as_tetrahedra(content: meshio.Mesh) -> meshio.Mesh:
     """Return the content of a mesh file with its linear cells split, and their data with them."""
-    if not any(block.type in _SOLID for block in content.cells):
-        return content
     cells, parents = [], []
     for block in content.cells:
         kind, rows = block.type, np.asarray(block.data)
         of = np.arange(len(rows))
-        if kind in _SOLID:
+        if kind in SPLIT:
             kind, (rows, of) = "tetra", tetrahedra_of(rows)
         elif kind == "quad":
             kind, rows, of = "triangle", triangles_of(rows), np.repeat(of, 2)
