@@ -23,6 +23,7 @@ HERE = Path(__file__).parent
 SEED = 0
 GROUP_LETTERS = 3  # of a name that say its group: the clots' calcium
 QUANTILE = 1.645  # sds
+OF_ALL = ("median[", "sd[", "correlation[")  # beginnings of names of what all subjects share
 COLOURS = (BLUE, ORANGE, GREEN)
 
 
@@ -47,7 +48,7 @@ def cohort(pieces: Iterator[Piece], law: str, engine: str) -> Case:
         "groups": groups,
         "accepted": sum(of["verdict"] == "accepted" for of in told["members"].values()),
         "failed": told["failed"],
-        "population": told["population"],
+        "population": {n: row for n, row in told["population"].items() if n.startswith(OF_ALL)},
         "members": told["members"],
         "seconds": round(seconds, 1),
     }
@@ -60,7 +61,7 @@ def draw(cases: list[Case], path: Path) -> None:
     )
     for axis, case in zip(axes[0], cases, strict=True):
         names, groups = list(case["members"]), sorted(set(case["groups"].values()))
-        parameter = next(iter(case["population"]))
+        parameter = next(iter(case["population"])).removeprefix("median[").removesuffix("]")
         for k, name in enumerate(names):
             row: dict[str, float] = case["members"][name][parameter]
             colour = COLOURS[groups.index(case["groups"][name]) % len(COLOURS)]

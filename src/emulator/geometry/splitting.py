@@ -35,7 +35,8 @@ def triangles_of(quadrilaterals: np.ndarray) -> np.ndarray:
 def tetrahedra_of(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the tetrahedra (t, 4) of cells (m, 5, 6 or 8), and the row (t,) of the cell of each.
 
-    Those of a cell come one after the other; they are not oriented.
+    Those of a cell come one after the other; they are not oriented. A cell with a corner twice, as
+    a hexahedron that is a prism, gives fewer.
     """
     first, numbers = cells.min(axis=1), np.arange(len(cells))
     rows, parents = [np.empty((0, 4), cells.dtype)], [numbers[:0]]
@@ -48,8 +49,10 @@ def tetrahedra_of(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             triangles, of = triangles_of(triangles), np.repeat(of, 2)
         rows.append(np.column_stack([first[of], triangles]))
         parents.append(of)
-    order = np.argsort(np.concatenate(parents), kind="stable")
-    return np.concatenate(rows)[order], np.concatenate(parents)[order]
+    tetrahedra, of = np.concatenate(rows), np.concatenate(parents)
+    whole = (np.diff(np.sort(tetrahedra, axis=1), axis=1) != 0).all(axis=1)
+    order = np.argsort(of[whole], kind="stable")
+    return tetrahedra[whole][order], of[whole][order]
 
 
 def as_tetrahedra(content: meshio.Mesh) -> meshio.Mesh:
@@ -64,7 +67,9 @@ def as_tetrahedra(content: meshio.Mesh) -> meshio.Mesh:
             kind, rows, of = "triangle", triangles_of(rows), np.repeat(of, 2)
         cells.append((kind, rows))
         parents.append(of)
+    kinds = ", ".join(sorted({block.type for block in content.cells} & SPLIT))
     split = copy(content)
+    split.info = [*(content.info or []), f"{kinds} cells as such: they are split into tetrahedra"]
     split.cells = [meshio.CellBlock(kind, rows) for kind, rows in cells]
     split.cell_data = {name: _repeated(of, parents) for name, of in content.cell_data.items()}
     split.cell_sets = {name: _members(of, parents) for name, of in content.cell_sets.items()}

@@ -53,6 +53,13 @@ def test_tetrahedra_fill_a_cell_however_its_corners_are_numbered(kind):
         assert volumes.min() > 0.05
 
 
+def test_a_hexahedron_with_corners_twice_is_the_prism_that_it_is():
+    nodes = UNIT[6]
+    rows, _ = tetrahedra_of(np.array([[0, 1, 2, 2, 3, 4, 5, 5]]))
+    assert len(rows) == 3
+    assert np.abs(signed_volumes(nodes, rows)).sum() == pytest.approx(0.5)
+
+
 def test_neighbours_cut_their_common_face_alike():
     nodes, cells = grid(np.random.default_rng(0))
     rows, parents = tetrahedra_of(cells)
@@ -84,6 +91,7 @@ def test_a_file_of_hexahedra_has_its_groups_and_directions(tmp_path):
             meshio.write(source, content)
         body = read_body(source)
         assert len(body.mesh.elements) == 6 * len(cells)
+        assert "hexahedron cells as such: they are split into tetrahedra" in body.unused
         assert len(body.mesh.facet_set("left")) == 2 * len(left)
         assert np.array_equal(body.mesh.nodes[body.mesh.node_set("left"), 0], np.zeros(9))
         assert np.allclose(body.fibres, np.repeat(fibres, 6, axis=0))
