@@ -4,8 +4,9 @@ An executor is anything with ``submit`` of :mod:`concurrent.futures`, whose futu
 a pool of processes, ``dask.distributed``'s ``Client.get_executor()``, ``mpi4py.futures``,
 ``executorlib``. It belongs to the solver, which every place that does many solves has. What goes to
 a worker is a function, small arguments, and the digests of what they hold that is large: objects
-whose class says ``sent_once``, such as the simulator of a scene. A worker that lacks one says so,
-gets its bytes once, and then keeps what it builds and compiles of it.
+whose class says ``sent_once``, such as the simulator of a scene. Their bytes go with the tasks
+until as many workers have answered as there are; a worker that lacks one nevertheless says so. A
+worker keeps what it builds and compiles of them.
 
 Bytes are pickled by this process for its own workers, and are never read from a file.
 """
@@ -17,12 +18,13 @@ import io
 import multiprocessing
 import os
 import pickle
+import platform
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from contextlib import nullcontext
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cache, lru_cache
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -59,6 +61,7 @@ class Engine:
     ) -> None:
         self.workers = workers
         self._executor, self._renewed = executor, renewed
+        self._keepers = dict[str, set[str]]()  # names of the workers that keep an object, by digest
 
     def in_order[T, R](
         self,
@@ -78,7 +81,9 @@ class Engine:
         sender, pending = _Sender(function), deque[_Sent]()
         try:
             for number, task in enumerate(tasks):
-                pending.append(_Sent(number, sender.packed(task)))
+                sent = _Sent(number, sender.packed(task))
+                few = (len(self._keepers.get(d, ())) < self.workers for d in sender.digests)
+                pending.append(replace(sent, with_objects=any(few)))
                 self._submit(pending, sender)
                 while len(pending) > ((ahead or self.workers) if number >= alone else 0):
                     yield self._first(pending, sender)
@@ -99,10 +104,12 @@ class Engine:
             except BrokenExecutor as error:
                 self._renew(pending, error)
                 continue
-            if not isinstance(answer, _Lacking):
+            if isinstance(answer, _Answer):
+                for digest in sender.digests:
+                    self._keepers.setdefault(digest, set()).add(answer.worker)
                 pending.popleft()
-                return answer
-            sent.future, sent.with_objects = None, True
+                return answer.result
+            sent.future, sent.with_objects = None, True  # the answer is what it lacks
 
     def _submit(self, pending: deque[_Sent], sender: _Sender) -> None:
         """Submit the tasks that are not with the executor."""
@@ -130,6 +137,7 @@ class Engine:
         numbers = ", ".join(str(sent.number + 1) for sent in lost)
         tqdm.write(f"a worker died; done again: run {numbers or first.number + 1}", file=sys.stderr)
         self._executor = self._renewed()
+        self._keepers.clear()
         for sent in lost:
             sent.future = None
 
@@ -155,6 +163,13 @@ class _Sent:
         return future is not None and (not future.done() or future.exception() is not None)
 
 
+class _Answer(NamedTuple):
+    """The result of a task, and the name of the worker that did it."""
+
+    result: Any
+    worker: str
+
+
 class _Lacking(NamedTuple):
     """The answer of a worker that lacks an object, by its digest."""
 
@@ -173,6 +188,11 @@ class _Sender:
         self._digests = dict[int, tuple[Any, str]]()  # the object is kept, so its id is not reused
         self._function = self._kept_by_workers(function)
         self._cache = jax.config.jax_compilation_cache_dir
+
+    @property
+    def digests(self) -> list[str]:
+        """The digests of the function and of what it and the tasks so far hold that is large."""
+        return [*self._objects]
 
     def packed(self, thing: Any) -> bytes:
         """Return ``thing`` as bytes, with digests for the objects that are sent once."""
@@ -251,8 +271,8 @@ class _Unpickler(pickle.Unpickler):
 
 def _work(
     function: str, task: bytes, objects: Mapping[str, bytes], folder: str | None, asker: int
-) -> Any:
-    """Return the function's result for one task, or which objects it lacks.
+) -> _Answer | _Lacking:
+    """Return the function's result for one task, or which object this worker lacks.
 
     function : its digest.
     folder : the folder of compiled programs, shared with the process that asks.
@@ -266,7 +286,8 @@ def _work(
     except _AbsentError as digest:
         return _Lacking(str(digest))
     with nullcontext() if os.getpid() == asker else one_blas_thread():
-        return jax.block_until_ready(call(argument))
+        result = jax.block_until_ready(call(argument))
+    return _Answer(result, f"{platform.node()} {os.getpid()}")
 
 
 # ---- by words ------------------------------------------------------------------------------------

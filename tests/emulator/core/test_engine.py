@@ -2,6 +2,7 @@
 
 import os
 import signal
+import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
 from operator import neg
@@ -72,6 +73,23 @@ def test_results_come_in_the_order_of_the_tasks_and_few_are_begun_early():
     assert [next(results), len(taken)] == [0, 1]  # the first one is alone
     assert [next(results), len(taken)] == [-1, 4]
     assert list(results) == [-2, -3, -4, -5, -6, -7, -8]
+
+
+def slow(seconds):
+    """The number of this process, after a while."""
+    time.sleep(seconds)
+    return os.getpid()
+
+
+def test_tasks_that_are_all_begun_at_once_keep_all_workers_busy():
+    """Even where no worker has the function yet, and the first task is a long one."""
+    with ProcessPoolExecutor(2, mp_context=SPAWN) as pool:
+        engine = Engine(pool, 2)
+        began = time.perf_counter()
+        pids = list(engine.in_order(slow, iter([12.0, *[2.0] * 5]), alone=0, ahead=6))
+        seconds = time.perf_counter() - began
+    assert len(set(pids[1:]) - {pids[0]}) == 1  # the other worker did all others
+    assert seconds < 18.0  # and 22 by one
 
 
 def test_what_is_pending_may_be_left_by_futures_without_cancel():
