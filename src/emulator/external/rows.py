@@ -193,6 +193,12 @@ class Process(NamedTuple):
         return correlations(self.left_out / self.sd @ (self.modes / sizes[:, None]).T)
 
 
+def _root(covariance: np.ndarray) -> np.ndarray:
+    """Return the symmetric root of a covariance (n, n), in which signs of eigenvectors cancel."""
+    values, vectors = np.linalg.eigh(covariance)
+    return (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+
+
 def correlations(errors: np.ndarray) -> np.ndarray:
     """Return the correlations (n, n) of errors (c, n) about zero; of one that is 0, with none."""
     unit = errors / np.where(errors.any(axis=0), np.linalg.norm(errors, axis=0), 1.0)
@@ -370,7 +376,7 @@ class RowsMap(OutputsMap):
         x = (np.asarray(self.scene.to_unit(jnp.asarray(theta))) - p.centre) / p.width
         modes = p.modes[:, outputs]
         correlated = p.correlations()
-        together = np.linalg.cholesky(correlated + _JITTER * np.eye(len(modes)))
+        together = _root(correlated)
         errors = rng.normal(size=(count, len(x), len(outputs))) * p.rest[outputs]
         normals = rng.normal(size=(count, len(x), len(modes))) @ together.T
         roots = np.zeros((len(modes), len(x), len(x)))
@@ -380,9 +386,7 @@ class RowsMap(OutputsMap):
             whitened = regression.whitened(np.asarray(_kernel(logs, p.at, x)))
             remaining = np.asarray(_covariance(logs, x)) - whitened.T @ whitened
             remaining *= p.variance[k]
-            values, vectors = np.linalg.eigh(remaining)  # singular where two draws are one
-            # The symmetric root: signs of eigenvectors, of which each mode has others, cancel.
-            roots[k] = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+            roots[k] = _root(remaining)  # singular where two draws are one
             errors += (normals[..., k] @ roots[k])[..., None] * modes[k]
         between = correlated * np.einsum("kab,lab->akl", roots, roots, optimize=True)
         variances = p.rest[outputs] ** 2 + np.einsum("kj,akj->aj", modes, between @ modes)
