@@ -85,9 +85,9 @@ def with_emulator_error(problem: Problem) -> Problem:
 def error_modes(errors: np.ndarray) -> np.ndarray:
     r"""Return the modes V (s, n) of the covariance :math:`C = V^T V` of errors (c, n).
 
-    With sds :math:`s_j` that a few far ones do not make, 90 % quantiles over a Gaussian's, and
-    correlations R, :math:`C_{jk} = s_j R_{jk} s_k = Q \Lambda Q^T` and
-    :math:`V = \Lambda^{1/2} Q^T`.
+    The sds :math:`s_j` are 90 % quantiles over a Gaussian's, so that a few far errors do not set
+    them. With correlations R, the modes follow from
+    :math:`C_{jk} = s_j R_{jk} s_k = Q \Lambda Q^T` as :math:`V = \Lambda^{1/2} Q^T`.
     """
     sds = _sds(errors)
     values, vectors = np.linalg.eigh(np.outer(sds, sds) * correlations(errors))

@@ -5,8 +5,8 @@ a pool of processes, ``dask.distributed``'s ``Client.get_executor()``, ``mpi4py.
 ``executorlib``. It belongs to the solver, which every place that does many solves has. What goes to
 a worker is a function, small arguments, and the digests of what they hold that is large: objects
 whose class says ``sent_once``, such as the simulator of a scene. Their bytes go with the tasks
-until as many workers have answered as there are; a worker that lacks one nevertheless says so. A
-worker keeps what it builds and compiles of them.
+until all workers have answered, or many times as many tasks are done as there are workers; a worker
+that still lacks one says so. It keeps what it builds and compiles of them.
 
 Bytes are pickled by this process for its own workers, and are never read from a file.
 """
@@ -24,7 +24,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from contextlib import nullcontext
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, lru_cache
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -45,6 +45,7 @@ SENT_ONCE = "sent_once"
 STAYS = "stays"
 """Metadata of a dataclass's field that no worker gets."""
 _DEATHS = 3  # of workers, with one task, after which it is named as their cause
+_ANSWERS = 8  # a worker, after which an object goes only to whom it lacks
 _KEPT = 8  # objects that a worker keeps, the last used
 
 
@@ -61,7 +62,7 @@ class Engine:
     ) -> None:
         self.workers = workers
         self._executor, self._renewed = executor, renewed
-        self._keepers = dict[str, set[str]]()  # names of the workers that keep an object, by digest
+        self._keepers = dict[str, list[str]]()  # the worker of each first answer, by object
 
     def in_order[T, R](
         self,
@@ -81,9 +82,9 @@ class Engine:
         sender, pending = _Sender(function), deque[_Sent]()
         try:
             for number, task in enumerate(tasks):
-                sent = _Sent(number, sender.packed(task))
-                few = (len(self._keepers.get(d, ())) < self.workers for d in sender.digests)
-                pending.append(replace(sent, with_objects=any(few)))
+                packed = sender.packed(task)  # which adds digests
+                with_objects = any(map(self._is_new, sender.digests))
+                pending.append(_Sent(number, packed, with_objects=with_objects))
                 self._submit(pending, sender)
                 while len(pending) > ((ahead or self.workers) if number >= alone else 0):
                     yield self._first(pending, sender)
@@ -105,11 +106,19 @@ class Engine:
                 self._renew(pending, error)
                 continue
             if isinstance(answer, _Answer):
-                for digest in sender.digests:
-                    self._keepers.setdefault(digest, set()).add(answer.worker)
+                for digest in filter(self._is_new, sender.digests):
+                    self._keepers.setdefault(digest, []).append(answer.worker)
                 pending.popleft()
                 return answer.result
             sent.future, sent.with_objects = None, True  # the answer is what it lacks
+
+    def _is_new(self, digest: str) -> bool:
+        """Say whether a worker may lack an object: not all have answered since it was sent.
+
+        An executor may have fewer workers than it seems, or threads, which are one worker.
+        """
+        workers = self._keepers.get(digest, [])
+        return len(set(workers)) < self.workers and len(workers) < _ANSWERS * self.workers
 
     def _submit(self, pending: deque[_Sent], sender: _Sender) -> None:
         """Submit the tasks that are not with the executor."""

@@ -32,10 +32,10 @@ from emulator.core.errors import InputError
 from emulator.geometry.mesh import boundary_facets, find_rows
 from emulator.geometry.splitting import FACES
 
-ABAQUS_FACES = {4: ((0, 1, 2), (0, 3, 1), (1, 3, 2), (2, 3, 0)), **FACES}
-"""The corners of the faces S1, S2, ... of Abaqus's elements, by their number of corners."""
-ABAQUS_CORNERS = {4: 4, 10: 4, 6: 6, 8: 8}
-"""The number of corners of an element, by that of its nodes."""
+# The corners of the faces S1, S2, ... of Abaqus's elements, by their number of corners, and that
+# number by the one of their nodes.
+_FACES = {4: ((0, 1, 2), (0, 3, 1), (1, 3, 2), (2, 3, 0)), **FACES}
+_CORNERS = {4: 4, 10: 4, 6: 6, 8: 8}
 # Types of elements that meshio does not know.
 _TYPES = {"C3D4H": "tetra", "C3D4T": "tetra", "C3D10HS": "tetra10", "M3D3": "triangle"}
 
@@ -45,7 +45,7 @@ def abaqus_face(word: str, nodes: int) -> tuple[int, ...]:
 
     nodes : the number of nodes of the element.
     """
-    faces = ABAQUS_FACES.get(ABAQUS_CORNERS.get(nodes, 0), ())
+    faces = _FACES.get(_CORNERS.get(nodes, 0), ())
     number = int(word[1:]) if word[:1].upper() == "S" and word[1:].isdecimal() else 0
     return faces[number - 1] if 1 <= number <= len(faces) else ()
 

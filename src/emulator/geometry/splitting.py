@@ -35,8 +35,8 @@ def triangles_of(quadrilaterals: np.ndarray) -> np.ndarray:
 def tetrahedra_of(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the tetrahedra (t, 4) of cells (m, 5, 6 or 8), and the row (t,) of the cell of each.
 
-    Those of a cell come one after the other; they are not oriented. A cell with a corner twice, as
-    a hexahedron that is a prism, gives fewer.
+    The tetrahedra of a cell come one after the other, and are not oriented. A cell has fewer of
+    them where a corner is there twice: a hexahedron may be a prism.
     """
     first, numbers = cells.min(axis=1), np.arange(len(cells))
     rows, parents = [np.empty((0, 4), cells.dtype)], [numbers[:0]]

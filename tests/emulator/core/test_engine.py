@@ -90,6 +90,21 @@ def test_tasks_that_are_all_begun_at_once_keep_all_workers_busy():
     assert min(began for began, _ in others) < first_ended
 
 
+def test_objects_no_longer_go_with_tasks_once_enough_of_them_were_answered():
+    """An executor may claim more workers than answer: threads are one worker."""
+
+    carried = list[bool]()
+
+    class Counting(Bare):
+        def submit(self, function, *arguments):
+            carried.append(bool(arguments[2]))
+            return super().submit(function, *arguments)
+
+    assert list(Engine(Counting(), 2).in_order(neg, iter(range(60)))) == [-k for k in range(60)]
+    assert all(carried[:8])
+    assert not any(carried[30:])
+
+
 def test_what_is_pending_may_be_left_by_futures_without_cancel():
     results = Engine(Bare(), 2).in_order(neg, iter(range(9)))
     assert [next(results), next(results)] == [0, -1]
