@@ -24,7 +24,7 @@ are swapped or a sign is reversed.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import combinations
 
@@ -125,27 +125,32 @@ def _apart(u: np.ndarray, fields: Sequence[np.ndarray]) -> float:
 
 
 def predict_over_prior(
-    predict: Predict, observe: Observations, draws: np.ndarray
+    predict: Callable[[np.ndarray], tuple[Mapping[str, np.ndarray], np.ndarray]],
+    observe: Observations,
+    draws: np.ndarray,
 ) -> dict[str, np.ndarray]:
     """Return predictions (s, ...) without noise at draws of the prior and at its ends.
 
     The ends are taken one unknown at a time, and then together where each makes the prediction
     smaller, or larger.
 
+    predict : maps values (s, q) of the unknowns to predictions and their validity (s,).
+    observe : the observations.
+    draws : draws of the unknowns' prior, (c, q).
+
     :class:`InputError` where the forward map has no valid answer at any of them.
     """
-    one, columns = jax.jit(predict), np.arange(draws.shape[1])
+    columns = np.arange(draws.shape[1])
     predictions: dict[str, list[np.ndarray]] = {name: [] for name in observe.parts}
 
-    def sizes(rows: Iterable[np.ndarray]) -> dict[str, list[float]]:
+    def sizes(rows: np.ndarray) -> dict[str, np.ndarray]:
         """Add the predictions at ``rows`` and return their norms, NaN where there is none."""
-        norms: dict[str, list[float]] = {name: [] for name in predictions}
-        for row in rows:
-            means, valid = one(jnp.asarray(row))
-            for name, mean in means.items():
-                norms[name].append(_norm(np.asarray(mean)) if bool(valid) else np.nan)
-                predictions[name] += [np.asarray(mean)] if bool(valid) else []
-        return norms
+        means, valid = predict(rows)
+        for name, values in means.items():
+            predictions[name] += [*values[valid]]
+        return {
+            n: np.where(valid, [_norm(v) for v in values], np.nan) for n, values in means.items()
+        }
 
     sizes(draws[:_DRAWS])
     middle, ends = np.median(draws, axis=0), np.stack([draws.min(axis=0), draws.max(axis=0)])
@@ -153,7 +158,7 @@ def predict_over_prior(
     for norms in sizes(one_by_one.reshape(-1, len(columns))).values():
         low, high = np.reshape(norms, ends.shape)
         smaller = (high < low).astype(int)
-        sizes([ends[smaller, columns], ends[1 - smaller, columns]])
+        sizes(np.stack([ends[smaller, columns], ends[1 - smaller, columns]]))
     if not all(predictions.values()):
         raise InputError(
             f"the forward map has no valid answer at any of {_DRAWS} draws of the prior; "

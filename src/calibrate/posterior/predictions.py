@@ -26,7 +26,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
-from numpyro import handlers
 
 from calibrate.measurements import Observation, Observations
 from calibrate.measurements.klotz import PRESSURE_SCATTER, Klotz
@@ -34,10 +33,11 @@ from calibrate.measurements.outputs import Outputs
 from calibrate.measurements.volume import pressure_volume
 from calibrate.noise.correlated import SpatialNormal
 from calibrate.statistical_model import Data, Model
+from calibrate.statistical_model.density import density_of, prior_draws
+from calibrate.statistical_model.many_draws import in_blocks, means_at
 from emulator.core.errors import InputError, check_known, check_seed
 from emulator.core.kept import kept
-from emulator.surrogates.fem import FEMForward
-from emulator.surrogates.protocol import ForwardMap, Prediction
+from emulator.surrogates.protocol import ForwardMap
 
 REPLICATES = 500  # draws of the posterior, and of the prior, at which data is replicated
 
@@ -67,8 +67,8 @@ def log_likelihood(
     means : data without noise (chains, draws, *shape), where the draws are not of the model's own
         posterior; by its forward map otherwise.
     """
-    terms = _over_draws(model, _log_likelihood)((_flat(draws), _flat(means)), data)
-    return _unflat(terms, draws)
+    program, at = _over_draws(model, _log_likelihood), _means(model, draws, means)
+    return _unflat(program((_flat(draws), at), dict(data)), draws)
 
 
 @kept
@@ -84,8 +84,7 @@ def replicates(
 
     ``means`` as of :func:`log_likelihood`.
     """
-    keys = jax.random.split(rng_key, next(iter(draws.values())).size)
-    return _unflat(_over_draws(model, _replicate)((_flat(draws), _flat(means), keys)), draws)
+    return _unflat(_replicated(model, _flat(draws), _means(model, draws, means), rng_key), draws)
 
 
 def prior_replicates(model: Model, rng_key: jax.Array, count: int = REPLICATES) -> Prior:
@@ -93,12 +92,12 @@ def prior_replicates(model: Model, rng_key: jax.Array, count: int = REPLICATES) 
 
     A tenth more is drawn; draws at which the map has no answer are left out (:func:`shortfall`).
     """
-    keys = jax.random.split(rng_key, count + count // 10)
-    if isinstance(model.forward, FEMForward):
-        prior = _solved_prior(model, model.forward, keys)
-    else:
-        prior = _over_draws(model, _prior)((keys,))
-    draws, data, valid = jax.tree.map(np.asarray, prior)
+    density = density_of(model)
+    draw_key, data_key = jax.random.split(rng_key)
+    z = prior_draws(density, draw_key, count + count // 10)
+    draws = in_blocks(density.constrain, z)
+    means, valid = means_at(model, draws)
+    data = jax.tree.map(np.asarray, _replicated(model, draws, means, data_key))
     rows = np.flatnonzero(valid)[:count]
     return Prior(*({n: values[rows] for n, values in by.items()} for by in (draws, data)))
 
@@ -121,68 +120,35 @@ def spread(draws: Draws, count: int = REPLICATES) -> tuple[np.ndarray, Draws]:
     return rows, {name: np.asarray(values)[:, rows] for name, values in draws.items()}
 
 
-def _solved_prior(model: Model, fem: FEMForward, keys: jax.Array) -> Any:
-    """Return :func:`_prior` with each of the keys, by solves that are driven from Python.
-
-    The theta of all draws first, then every solve, then the data: keys decide on all of them alike.
-    """
-    states = model.states
-    prior_of = partial(_prior, model)
-    at_rest = Prediction(
-        jnp.zeros((len(states.states), len(model.observe.nodes), 3)), jnp.array(True)
-    )
-    draws = jax.jit(jax.vmap(lambda key: prior_of(key, at_rest)[0]))(keys)
-    thetas = jax.jit(jax.vmap(states.thetas))({name: draws[name] for name in states.unknowns})
-    solutions = fem.evaluate_all(thetas.reshape(-1, thetas.shape[-1]))
-    shape = thetas.shape[:2]
-    prediction = Prediction(
-        solutions.displacement.reshape(*shape, *solutions.displacement.shape[1:]),
-        jnp.all(solutions.valid.reshape(shape), axis=1),
-    )
-    return jax.jit(jax.vmap(prior_of))(keys, prediction)
+def _means(model: Model, draws: Draws, means: Draws | None) -> dict[str, Any]:
+    """Return data without noise (s, *shape) at all draws: those that are known, or the map's."""
+    flat = _flat(draws)
+    return means_at(model, flat)[0] if means is None else _flat(means)
 
 
-def _prior(model: Model, rng_key: jax.Array, prediction: Prediction | None = None) -> Any:
-    """Return a draw of the prior, data replicated there, and the validity of the prediction."""
-    trace = handlers.trace(handlers.seed(model, rng_key)).get_trace(None, prediction)
-    draw = {name: trace[name]["value"] for name in model.names}
-    data = {name: trace[_site(name)]["value"] for name in model.observe.parts}
-    valid = trace["valid"]
-    return draw, data, jnp.isfinite(valid["fn"].log_prob(valid["value"]))
+def _replicated(model: Model, draws: Draws, means: Draws, rng_key: jax.Array) -> dict[str, Any]:
+    """Return data replicated at draws (s,), around their ``means`` (s, *shape)."""
+    keys = jax.random.split(rng_key, len(next(iter(draws.values()))))
+    return _over_draws(model, _replicate)((draws, means, keys))
 
 
-def _log_likelihood(
-    model: Model, draw: Data, means: Data | None, data: Data
-) -> dict[str, jax.Array]:
-    around = model.distributions(draw, model.predict(draw)[0] if means is None else means)
+def _log_likelihood(model: Model, draw: Data, means: Data, data: Data) -> dict[str, jax.Array]:
+    around = model.distributions(draw, means)
     return {name: _pointwise(d, data[name]) for name, d in around.items()}
 
 
-def _replicate(
-    model: Model, draw: Data, means: Data | None, rng_key: jax.Array
-) -> dict[str, jax.Array]:
-    if means is not None:
-        error_key, *keys = jax.random.split(rng_key, len(means) + 1)
-        around = model.distributions(draw, model.means_with_errors(error_key, draw, means))
-        return {name: d.sample(k) for (name, d), k in zip(around.items(), keys, strict=True)}
-    seeded = handlers.substitute(handlers.seed(model, rng_key), data=dict(draw))
-    trace = handlers.trace(seeded).get_trace()
-    return {name: trace[_site(name)]["value"] for name in model.observe.parts}
+def _replicate(model: Model, draw: Data, means: Data, rng_key: jax.Array) -> dict[str, jax.Array]:
+    error_key, *keys = jax.random.split(rng_key, len(means) + 1)
+    around = model.distributions(draw, model.means_with_errors(error_key, draw, means))
+    return {name: d.sample(k) for (name, d), k in zip(around.items(), keys, strict=True)}
 
 
 @kept
 def _over_draws(model: Model, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the program of ``function(model, *one, *rest)`` over many draws, and the rest.
-
-    It takes one draw after the other: maps that solve gain nothing from being vectorised.
-    """
+    """Return the program of ``function(model, *one, *rest)`` over many draws, one by one."""
     return jax.jit(
         lambda draws, *rest: jax.lax.map(lambda one: function(model, *one, *rest), draws)
     )
-
-
-def _site(name: str) -> str:
-    return f"observed_{name}"
 
 
 def _pointwise(distribution: Any, value: jax.Array) -> jax.Array:
@@ -195,10 +161,8 @@ def _pointwise(distribution: Any, value: jax.Array) -> jax.Array:
     return log_densities if log_densities.shape == jnp.shape(value) else jnp.sum(log_densities)
 
 
-def _flat(values: Draws | None) -> dict[str, jax.Array] | None:
+def _flat(values: Draws) -> dict[str, jax.Array]:
     """Return the values with the chains one after the other, (s, *shape)."""
-    if values is None:
-        return None
     return {n: jnp.asarray(v).reshape(-1, *np.shape(v)[2:]) for n, v in values.items()}
 
 

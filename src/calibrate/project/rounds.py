@@ -50,8 +50,9 @@ from calibrate.posterior.diagnosis import (
 )
 from calibrate.project.problem import Problem, build_model, read_problem
 from calibrate.statistical_model import FEMLikelihood, Model
-from calibrate.statistical_model.density import density_of, in_blocks, prior_draws
+from calibrate.statistical_model.density import density_of, prior_draws
 from calibrate.statistical_model.fem_likelihood import runs_of
+from calibrate.statistical_model.many_draws import in_blocks
 from calibrate.statistical_model.pool import Pool
 from calibrate.statistical_model.predictive import Predictive
 from emulator.core.display import counting

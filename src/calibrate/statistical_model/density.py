@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -19,16 +18,14 @@ from numpyro import handlers
 from numpyro.distributions.transforms import biject_to
 from numpyro.infer.util import potential_energy
 
+from calibrate.statistical_model.many_draws import BATCH, batches, in_blocks, means_at
 from calibrate.statistical_model.model import Data, Model
 from emulator.core.kept import kept
 from emulator.core.machine import cores
 from emulator.fem.campaign import at_once
-from emulator.surrogates.corrected import CorrectedForward
 from emulator.surrogates.fem import FEMForward
 from emulator.surrogates.protocol import ForwardMap
 
-_BLOCK = 256  # points evaluated by one call of a program, so that it is compiled for one shape
-BATCH = 32  # points of a block that are vectorised
 _MOST_PILOTED = 20  # coordinates; more have more bends than a pilot run can tell
 _FARTHEST = 40.0  # |z| at which a bounded parameter is its bound in double precision
 
@@ -57,6 +54,8 @@ class Density(Target):
 
     log_prior : (z (p,),) -> (); the log prior density of ``z``, which integrates to 1.
     log_likelihood : (z (p,), data) -> (); ``-inf`` where the forward map has no answer.
+    around : (z (p,), means, validity, data) -> (); log_likelihood, the map's answer being known.
+    means : (z (s, p),) -> data without noise, (s, *shape) by name, and validity (s,).
     prior_draw : (rng_key,) -> z (p,) from the prior.
     constrain : (z (s, p),) -> draws by name, each (s,).
     unconstrain : (draw by name, each ()) -> z (p,).
@@ -66,6 +65,8 @@ class Density(Target):
 
     log_prior: Callable[[jax.Array], jax.Array]
     log_likelihood: Callable[[jax.Array, Data], jax.Array]
+    around: Callable[[jax.Array, Data, jax.Array, Data], jax.Array]
+    means: Callable[[jax.Array], tuple[dict[str, np.ndarray], np.ndarray]]
     prior_draw: Callable[[jax.Array], jax.Array]
     constrain: Callable[[jax.Array], dict[str, jax.Array]]
     unconstrain: Callable[[Mapping[str, jax.Array]], jax.Array]
@@ -89,7 +90,10 @@ def density_of(model: Model) -> Density:
         return -potential_energy(model.draw_unknowns, (), {}, coordinates(z))
 
     def log_likelihood(z: jax.Array, data: Data) -> jax.Array:
-        return model.map_log_likelihood(draw(z), data)
+        return around(z, *model.predict(draw(z)), data)
+
+    def around(z: jax.Array, means: Data, valid: jax.Array, data: Data) -> jax.Array:
+        return jnp.where(valid, model.log_likelihood(draw(z), means, data), -jnp.inf)
 
     def draw(z: jax.Array) -> dict[str, jax.Array]:
         return {name: transforms[name](value) for name, value in coordinates(z).items()}
@@ -100,6 +104,7 @@ def density_of(model: Model) -> Density:
     def unconstrain(draw: Mapping[str, jax.Array]) -> jax.Array:
         return jnp.stack([transforms[name].inv(draw[name]) for name in names])
 
+    constrain = jax.jit(jax.vmap(draw))
     return Density(
         log_density=log_density,
         dimension=len(names),
@@ -108,11 +113,13 @@ def density_of(model: Model) -> Density:
         whitened=len(names) > _MOST_PILOTED,
         log_prior=log_prior,
         log_likelihood=log_likelihood,
+        around=around,
+        means=lambda z: means_at(model, constrain(z)),
         prior_draw=prior_draw,
-        constrain=jax.jit(jax.vmap(draw)),
+        constrain=constrain,
         unconstrain=unconstrain,
         names=names,
-        batches=not isinstance(model.forward, FEMForward | CorrectedForward),
+        batches=batches(model.forward),
     )
 
 
@@ -132,17 +139,25 @@ class Heights(NamedTuple):
 
 
 def heights(density: Density, z: np.ndarray, data: Data) -> Heights:
-    """Return the log densities at points z (s, p); the program is compiled once a density."""
-    return in_blocks(partial(_height_program(density), data=data), z)
+    """Return the log densities at points z (s, p)."""
+    return in_blocks(lambda block: heights_around(density, block, density.means(block), data), z)
+
+
+def heights_around(density: Density, z: jax.Array, means: Any, data: Data) -> Heights:
+    """Return the log densities at points z (s, p), where ``means`` are known, with validity."""
+    return _height_program(density)(z, *means, data)
 
 
 @kept
 def _height_program(density: Density) -> Callable[..., Heights]:
-    def one(z: jax.Array, data: Data) -> Heights:
-        prior, likelihood = density.log_prior(z), density.log_likelihood(z, data)
-        return Heights(without_nan(prior), without_nan(likelihood))
+    def many(z: jax.Array, means: Data, valid: jax.Array, data: Data) -> Heights:
+        def one(at: tuple[jax.Array, Data, jax.Array]) -> Heights:
+            likelihood = density.around(*at, data)
+            return Heights(without_nan(density.log_prior(at[0])), without_nan(likelihood))
 
-    return jax.jit(lambda z, data: jax.lax.map(partial(one, data=data), z, batch_size=BATCH))
+        return jax.lax.map(one, (z, means, valid), batch_size=BATCH)
+
+    return jax.jit(many)
 
 
 @kept
@@ -154,17 +169,6 @@ def prior_draws(density: Density, rng_key: jax.Array, count: int) -> np.ndarray:
     """Return points z (count, p) drawn from the prior."""
     keys = jax.random.key_data(jax.random.split(rng_key, count))
     return finite_coordinates(in_blocks(_prior_program(density), np.asarray(keys)))
-
-
-def in_blocks(program: Callable[..., Any], *points: np.ndarray) -> Any:
-    """Return ``program`` of arrays (s, ...), called with padded blocks of one shape."""
-    count = len(points[0])
-    padded = [np.concatenate([x, np.repeat(x[-1:], -count % _BLOCK, axis=0)]) for x in points]
-    parts = [
-        jax.tree.map(np.asarray, program(*(jnp.asarray(x[k : k + _BLOCK]) for x in padded)))
-        for k in range(0, len(padded[0]), _BLOCK)
-    ]
-    return jax.tree.map(lambda *arrays: np.concatenate(arrays)[:count], *parts)
 
 
 def without_nan(log_density: jax.Array) -> jax.Array:

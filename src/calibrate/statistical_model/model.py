@@ -15,7 +15,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import jax
@@ -35,6 +35,7 @@ from calibrate.priors import Dependence, Prior, dependence_of
 from calibrate.priors.priors import Conditional
 from calibrate.state_names import split
 from calibrate.statistical_model.load_states import LoadStates, boxed, load_states
+from calibrate.statistical_model.many_draws import means_at_rows
 from calibrate.statistical_model.prior_range import check_known, fit_to, standardised
 from emulator.core.errors import InputError
 from emulator.core.kept import kept
@@ -183,17 +184,10 @@ class Model:
 
     # The likelihood.
 
-    def __call__(
-        self, data: jax.Array | Data | None = None, prediction: Prediction | None = None
-    ) -> None:
-        """Run as a NumPyro program.
-
-        data : the data by name, or as they are when one thing is observed.
-        prediction : the result of :meth:`evaluate` at the drawn theta, where it is known already.
-        """
+    def __call__(self, data: jax.Array | Data | None = None) -> None:
+        """Run as a NumPyro program; ``data`` by name, or as they are if one thing is observed."""
         draw = self.draw_unknowns()
-        thetas = self.states.thetas(draw)
-        means, valid = self.means(thetas, prediction)
+        means, valid = self.predict(draw)
         # Where the forward map has no answer, the density is zero, not NaN.
         numpyro.factor("valid", jnp.where(valid, 0.0, -jnp.inf))
         observed = None if data is None else self.observe.name(data, "data")
@@ -370,7 +364,7 @@ def _before_data(model: Model) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return draws (c, q) of the unknowns' prior, and predictions over it, by observation."""
     draws = jax.jit(lambda key: model.prior_draws(key, PRIOR_DRAWS))(jax.random.key(0))
     stacked = np.stack([np.asarray(draws[name]) for name in model.states.unknowns], axis=1)
-    return stacked, predict_over_prior(model.predict_stacked, model.observe, stacked)
+    return stacked, predict_over_prior(partial(means_at_rows, model), model.observe, stacked)
 
 
 def model(

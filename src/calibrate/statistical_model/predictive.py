@@ -23,14 +23,14 @@ from jax.flatten_util import ravel_pytree
 from scipy.linalg import eigh
 
 from calibrate.statistical_model.density import (
-    BATCH,
     Density,
     density_of,
     finite_coordinates,
-    in_blocks,
+    heights_around,
     prior_draws,
     without_nan,
 )
+from calibrate.statistical_model.many_draws import BATCH, in_blocks
 from calibrate.statistical_model.model import Data, Model
 from emulator.surrogates.correction import Correction, correct, corrections
 
@@ -129,7 +129,15 @@ class Predictive:
 
     def by_map(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return ``prior``, ``cheap`` and ``means`` of :class:`Densities` at points (s, p)."""
-        return in_blocks(self._map_block, z)
+
+        def block(z: jax.Array) -> tuple[jax.Array, jax.Array, np.ndarray]:
+            means, valid = self._density.means(z)
+            at = heights_around(self._density, z, (means, valid), self.data)
+            # In the order of ravel_pytree.
+            flat = np.concatenate([m.reshape(len(m), -1) for m in jax.tree.leaves(means)], axis=1)
+            return at.prior, at.likelihood, np.where(valid[:, None], flat, np.nan)
+
+        return in_blocks(block, z)
 
     def evaluate(self, z: np.ndarray, correction: Correction) -> Densities:
         """Return log densities at points (s, p)."""
@@ -258,18 +266,6 @@ class Predictive:
 
     def _constrain(self, z: jax.Array) -> dict[str, jax.Array]:
         return jax.tree.map(lambda values: values[0], self._density.constrain(z[None]))
-
-    @_compiled
-    def _map_block(self, z: jax.Array) -> Any:
-        def one(z: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-            draws = self._constrain(z)
-            means, valid = self.model.predict(draws)
-            cheap = self.model.log_likelihood(draws, means, self.data)
-            flat = jnp.where(valid, ravel_pytree(means)[0], jnp.nan)
-            cheap = without_nan(jnp.where(valid, cheap, -jnp.inf))
-            return without_nan(self._density.log_prior(z)), cheap, flat
-
-        return jax.lax.map(one, z, batch_size=BATCH)
 
     @_compiled
     def _correction_block(self, correction: Correction, z: jax.Array, means: jax.Array) -> Any:

@@ -26,8 +26,8 @@ def write_tables(folder):
         rows = [f"{x:.4f},{y:.5f}" for x, y in zip(STRETCHES, stress, strict=True)]
         (folder / f"{name}.csv").write_text("\n".join(["stretch_x,stress_x", *rows]))
     (folder / "d.csv").write_text("stretch_x,stress_x\n1.1,\n1.2,\n")
-    rows = ["subject,data,noise:stress,group"]
-    rows += [f"{name},{name}.csv,0.05,{'ab'[k % 2]}" for k, name in enumerate("abcd")]
+    rows = ["subject,data,noise:stress,group,known:lam"]
+    rows += [f"{name},{name}.csv,0.05,{'ab'[k % 2]},100" for k, name in enumerate("abcd")]
     (folder / "subjects.csv").write_text("\n".join(rows))
     return folder / "subjects.csv"
 
