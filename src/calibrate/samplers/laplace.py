@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from calibrate.importance.weights import FEWEST_WEIGHTS, effective, normalised, pareto_shape
@@ -29,11 +28,10 @@ from calibrate.samplers.modes import (
     curvature,
     missed_mode,
     modes_at,
-    programs_of,
 )
 from calibrate.samplers.protocol import Context, Draws, Options, Sampler
 from calibrate.statistical_model import Data
-from calibrate.statistical_model.density import Density, prior_draws
+from calibrate.statistical_model.density import Density, heights, prior_draws
 from emulator.core.errors import InputError, SolverError
 
 _STARTS = 8  # draws of the prior from which modes are searched
@@ -136,7 +134,8 @@ def _draw(
     noise = np.asarray(jax.random.normal(key, (2 * count, size)))
     factor = np.linalg.cholesky(gaussian.precision)
     z = gaussian.mode + coloured(noise, factor)
-    lp = np.asarray(programs_of(density).heights(jnp.asarray(z), data))
+    at = heights(density, z, data)
+    lp = at.prior + at.likelihood
     rows = np.flatnonzero(np.isfinite(lp))[:count]
     if len(rows) < count:
         raise SolverError(

@@ -63,24 +63,18 @@ class _DensityPrograms(NamedTuple):
     """Compiled functions of a density.
 
     value_and_gradient : (z (p,), data) -> log density (), gradient (p,).
-    heights : (z (s, p), data) -> log densities (s,).
     climbing : the lock of a thread that climbs: one at a time, so that the gradient is compiled
         once.
     """
 
     value_and_gradient: Callable[..., Any]
-    heights: Callable[..., Any]
     climbing: Lock
 
 
 @kept
 def programs_of(density: Density) -> _DensityPrograms:
     """Return the compiled functions of a density, which the density keeps."""
-    return _DensityPrograms(
-        jax.jit(jax.value_and_grad(density.log_density)),
-        jax.jit(lambda z, data: jax.lax.map(lambda row: density.log_density(row, data), z)),
-        Lock(),
-    )
+    return _DensityPrograms(jax.jit(jax.value_and_grad(density.log_density)), Lock())
 
 
 def white_at_mode(

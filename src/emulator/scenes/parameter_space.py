@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Literal
 
 import jax
@@ -116,6 +116,8 @@ class Parameter:
 
 
 _SLACK = 1e-9  # round-off allowed, as a fraction of a range
+# An operation that is called by itself is a program to compile.
+_one_program = partial(jax.jit, static_argnums=0, inline=True)
 
 
 @dataclass(frozen=True)
@@ -138,16 +140,19 @@ class ParameterSpace:
         with jax.ensure_compile_time_eval():  # cached, so it must not be a tracer
             return self.from_unit(jnp.full(len(self.parameters), 0.5))
 
+    @_one_program
     def to_unit(self, theta: jax.Array) -> jax.Array:
         """Return the position (..., p) of ``theta`` (..., p) in the box, 0 to 1 inside."""
         columns = [p.to_unit(theta[..., k]) for k, p in enumerate(self.parameters)]
         return jnp.stack(columns, axis=-1)
 
+    @_one_program
     def from_unit(self, position: jax.Array) -> jax.Array:
         """Return the inverse of :meth:`to_unit`."""
         columns = [p.from_unit(position[..., k]) for k, p in enumerate(self.parameters)]
         return jnp.stack(columns, axis=-1)
 
+    @_one_program
     def rates(self, theta: jax.Array) -> jax.Array:
         """Return the derivatives (..., p) of ``theta`` (..., p) in its position in the box."""
         columns = [p.rate(theta[..., k]) for k, p in enumerate(self.parameters)]
