@@ -190,9 +190,9 @@ JOURNEYS: dict[str, tuple[int, Callable[[], Journey]]] = {
     "scene TOML to Scene": (18, scene_file),
     "Simulator.solve to law.energy": (12, solve),
     "calibrate infer to the data file": (35, parse),
-    "calibrate infer to the likelihood": (84, likelihood),
-    "table of a specimen to the likelihood": (82, specimen),
-    "calibrate certify to Simulator.solve": (73, check),
+    "calibrate infer to the likelihood": (87, likelihood),
+    "table of a specimen to the likelihood": (83, specimen),
+    "calibrate certify to Simulator.solve": (75, check),
 }
 """Journeys by what they lead from and to, each with the most files that it may enter."""
 

@@ -140,16 +140,14 @@ class Heights(NamedTuple):
 
 def heights(density: Density, z: np.ndarray, data: Data) -> Heights:
     """Return the log densities at points z (s, p)."""
-    return in_blocks(lambda block: heights_around(density, block, density.means(block), data), z)
-
-
-def heights_around(density: Density, z: jax.Array, means: Any, data: Data) -> Heights:
-    """Return the log densities at points z (s, p), where ``means`` are known, with validity."""
-    return _height_program(density)(z, *means, data)
+    program = height_program(density)
+    return in_blocks(lambda block: program(block, *density.means(block), data), z)
 
 
 @kept
-def _height_program(density: Density) -> Callable[..., Heights]:
+def height_program(density: Density) -> Callable[..., Heights]:
+    """Return the program (z (s, p), means, validity, data) -> log densities, as ``means`` gives."""
+
     def many(z: jax.Array, means: Data, valid: jax.Array, data: Data) -> Heights:
         def one(at: tuple[jax.Array, Data, jax.Array]) -> Heights:
             likelihood = density.around(*at, data)

@@ -26,7 +26,7 @@ from calibrate.statistical_model.density import (
     Density,
     density_of,
     finite_coordinates,
-    heights_around,
+    height_program,
     prior_draws,
     without_nan,
 )
@@ -132,7 +132,7 @@ class Predictive:
 
         def block(z: jax.Array) -> tuple[jax.Array, jax.Array, np.ndarray]:
             means, valid = self._density.means(z)
-            at = heights_around(self._density, z, (means, valid), self.data)
+            at = height_program(self._density)(z, means, valid, self.data)
             # In the order of ravel_pytree.
             flat = np.concatenate([m.reshape(len(m), -1) for m in jax.tree.leaves(means)], axis=1)
             return at.prior, at.likelihood, np.where(valid[:, None], flat, np.nan)

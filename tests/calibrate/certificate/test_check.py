@@ -150,7 +150,7 @@ def test_runs_are_doubled_until_they_decide(beam, fem, data, monkeypatch):
     posterior = exact_posterior(linear_model(beam, forward=fem), data)
     # A map that is FEM's needs no tail of its own; any other does.
     assert cal.certify(posterior, LinearSimulator(fem), draws=40).verdict == "accepted"
-    monkeypatch.setattr("calibrate.certificate.verdict._SAME", 0.0)
+    monkeypatch.setattr("calibrate.certificate.verdict._SAME", -1.0)
     few = cal.certify(posterior, LinearSimulator(fem), draws=40)
     assert few.verdict == "undecided"
     assert "too few FEM runs" in few.reason
@@ -170,7 +170,7 @@ def test_a_remainder_of_runs_is_added_to_the_last_pass(beam, fem, data, monkeypa
     assert [_further_runs(200, most) for most in (200, 224, 225, 400, 401, 600)] == [
         0, 0, 25, 200, 201, 200,
     ]  # fmt: skip
-    monkeypatch.setattr("calibrate.certificate.verdict._SAME", 0.0)
+    monkeypatch.setattr("calibrate.certificate.verdict._SAME", -1.0)
     posterior = exact_posterior(linear_model(beam, forward=fem), data)
     certificate = cal.certify(posterior, LinearSimulator(fem), draws=25, at_most=26)
     assert certificate.verdict == "undecided"
