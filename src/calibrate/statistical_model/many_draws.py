@@ -9,22 +9,45 @@ replicated data.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from calibrate.measurements import Observations
+from calibrate.statistical_model.load_states import LoadStates
 from emulator.core.kept import kept
 from emulator.surrogates.corrected import CorrectedForward
 from emulator.surrogates.fem import FEMForward
 from emulator.surrogates.protocol import ForwardMap, Prediction
 
-if TYPE_CHECKING:
-    from calibrate.statistical_model.model import Model
-
 BLOCK = 256  # points evaluated by one call of a program, so that it is compiled for one shape
 BATCH = 32  # points of a block that are vectorised
+
+
+class Predicting(Protocol):
+    """What a model (:class:`~calibrate.statistical_model.Model`) predicts with."""
+
+    @property
+    def forward(self) -> ForwardMap:
+        """The forward map of the observed nodes."""
+
+    @property
+    def observe(self) -> Observations:
+        """The observations."""
+
+    @property
+    def states(self) -> LoadStates:
+        """The unknowns of theta in each load state."""
+
+    def predict_stacked(self, values: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
+        """Return data by observation, and their validity, from values (q,) of the unknowns."""
+
+    def means(
+        self, thetas: jax.Array, prediction: Prediction | None = None
+    ) -> tuple[dict[str, jax.Array], jax.Array]:
+        """Return the same from theta in every load state (S, p), and what is solved there."""
 
 
 def batches(forward: ForwardMap) -> bool:
@@ -47,7 +70,9 @@ def in_blocks(program: Callable[..., Any], *points: Any) -> Any:
     return jax.tree.map(lambda *arrays: np.concatenate(arrays)[:count], *parts)
 
 
-def means_at(model: Model, draws: Mapping[str, Any]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def means_at(
+    model: Predicting, draws: Mapping[str, Any]
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Return data without noise at draws, (s, *shape) by observation, and their validity (s,).
 
     Where the forward map has no answer the data are 0.
@@ -58,28 +83,28 @@ def means_at(model: Model, draws: Mapping[str, Any]) -> tuple[dict[str, np.ndarr
     return means_at_rows(model, np.stack(columns, axis=1))
 
 
-def means_at_rows(model: Model, rows: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def means_at_rows(model: Predicting, rows: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Return :func:`means_at` values (s, q) of the unknowns, in their order."""
     parts = [_of_block(model, rows[k : k + BLOCK]) for k in range(0, len(rows), BLOCK)]
     return jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
 
 
-def _of_block(model: Model, rows: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def _of_block(model: Predicting, rows: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
     if isinstance(model.forward, FEMForward):
-        found = _by_solves(model, model.forward, jnp.asarray(rows))
+        answers = _by_solves(model, model.forward, jnp.asarray(rows))
     else:
         padded = np.concatenate([rows, np.repeat(rows[-1:], BLOCK - len(rows), axis=0)])
         size = _batch(model)
-        found = _program(model)(jnp.asarray(padded), -(-len(rows) // size))
-    return jax.tree.map(lambda values: np.asarray(values)[: len(rows)], found)
+        answers = _program(model)(jnp.asarray(padded), -(-len(rows) // size))
+    return jax.tree.map(lambda values: np.asarray(values)[: len(rows)], answers)
 
 
-def _batch(model: Model) -> int:
+def _batch(model: Predicting) -> int:
     return BATCH if batches(model.forward) else 1  # a solve waits for the longest of its batch
 
 
 @kept
-def _program(model: Model) -> Callable[[jax.Array, int], Any]:
+def _program(model: Predicting) -> Callable[[jax.Array, int], Any]:
     """Return the program of values (BLOCK, q) of the unknowns, and how many batches are wanted."""
     size = _batch(model)
 
@@ -98,7 +123,7 @@ def _program(model: Model) -> Callable[[jax.Array, int], Any]:
     return jax.jit(block)
 
 
-def _by_solves(model: Model, fem: FEMForward, rows: jax.Array) -> Any:
+def _by_solves(model: Predicting, fem: FEMForward, rows: jax.Array) -> Any:
     """Return data and validity by solves that are driven from Python, all states of a row each."""
     of_states, of_solved = _around_solves(model)
     thetas = of_states(rows)
@@ -109,7 +134,7 @@ def _by_solves(model: Model, fem: FEMForward, rows: jax.Array) -> Any:
 
 
 @kept
-def _around_solves(model: Model) -> tuple[Callable[..., Any], Callable[..., Any]]:
+def _around_solves(model: Predicting) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """Return the programs of theta in every state (s, S, p), and of data from displacements."""
     unknowns = model.states.unknowns
 

@@ -116,8 +116,7 @@ class Parameter:
 
 
 _SLACK = 1e-9  # round-off allowed, as a fraction of a range
-# An operation that is called by itself is a program to compile.
-_one_program = partial(jax.jit, static_argnums=0, inline=True)
+_one_program = partial(jax.jit, static_argnums=0, inline=True)  # in place of one an operation
 
 
 @dataclass(frozen=True)
