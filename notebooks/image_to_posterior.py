@@ -73,7 +73,7 @@ print(f"in the image {volume_of(filled):.0f}; at the end of systole {volume_of(c
 
 # %%
 image = replace(heart.mesh, nodes=heart.mesh.nodes + filled)
-F = np.eye(3) + np.asarray(em.fem.displacement_gradient(heart, filled))
+F = np.eye(3) + np.asarray(heart.gradients(filled))
 fibres = np.einsum("mqij,mqj->mqi", F, heart.fibres_at_points)
 fibres /= np.linalg.norm(fibres, axis=-1, keepdims=True)
 

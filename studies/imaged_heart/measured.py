@@ -142,7 +142,7 @@ def _followed(truth: dict[str, float]) -> _Followed | None:
     for _ in range(_ROUNDS):
         u = solved(truth["imaged"], 0.0)
         there = rule.directions(replace(scene.mesh, nodes=scene.mesh.nodes + u))[0]
-        F = np.eye(3) + np.asarray(em.fem.displacement_gradient(scene, u))
+        F = np.eye(3) + np.asarray(scene.gradients(u))
         back = np.linalg.solve(F, there[..., None])[..., 0]
         back /= np.linalg.norm(back, axis=-1, keepdims=True)
         turned = np.degrees(np.arccos(np.clip(np.abs(np.sum(back * fibres, axis=-1)), 0.0, 1.0)))

@@ -234,13 +234,14 @@ class Observations:
         """Return the function of :meth:`through` by the displacement of ``nodes``."""
         seen_through = getattr(forward, "seen_through", None)
         decode = None if seen_through is None else seen_through(self.decoding.matrix)
-        if decode is None:
-            return partial(self._by_displacement, forward)
-        return partial(self._decoded, decode)
+        if decode is not None:
+            return partial(self._decoded, decode)
 
-    def _by_displacement(self, forward: ForwardMap, thetas: jax.Array) -> tuple[Data, jax.Array]:
-        displacement, valid = in_every_state(forward, thetas)
-        return self(jnp.where(valid, displacement, 0.0), thetas), valid
+        def by_displacement(thetas: jax.Array) -> tuple[Data, jax.Array]:
+            displacement, valid = in_every_state(forward, thetas)
+            return self(jnp.where(valid, displacement, 0.0), thetas), valid
+
+        return by_displacement
 
     def _decoded(
         self, decode: Callable[[jax.Array], tuple[jax.Array, jax.Array]], thetas: jax.Array

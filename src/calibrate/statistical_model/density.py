@@ -54,24 +54,24 @@ class Density(Target):
 
     log_prior : (z (p,),) -> (); the log prior density of ``z``, which integrates to 1.
     log_likelihood : (z (p,), data) -> (); ``-inf`` where the forward map has no answer.
-    around : (z (p,), means, validity, data) -> (); log_likelihood, the map's answer being known.
-    means : (z (s, p),) -> data without noise, (s, *shape) by name, and validity (s,).
     prior_draw : (rng_key,) -> z (p,) from the prior.
     constrain : (z (s, p),) -> draws by name, each (s,).
     unconstrain : (draw by name, each ()) -> z (p,).
     names : the names of the coordinates, (p,), in their order.
     batches : whether many evaluations at once are cheap, as they are where none solves FEM.
+    means : (z (s, p),) -> data without noise, (s, *shape) by name, and validity (s,).
+    around : (z (p,), means, validity, data) -> (); log_likelihood where both are known, if it can.
     """
 
     log_prior: Callable[[jax.Array], jax.Array]
     log_likelihood: Callable[[jax.Array, Data], jax.Array]
-    around: Callable[[jax.Array, Data, jax.Array, Data], jax.Array]
-    means: Callable[[jax.Array], tuple[dict[str, np.ndarray], np.ndarray]]
     prior_draw: Callable[[jax.Array], jax.Array]
     constrain: Callable[[jax.Array], dict[str, jax.Array]]
     unconstrain: Callable[[Mapping[str, jax.Array]], jax.Array]
     names: tuple[str, ...]
     batches: bool = True
+    means: Callable[..., tuple[Any, np.ndarray]] = lambda z: ({}, np.ones(len(z), bool))
+    around: Callable[..., jax.Array] | None = None
 
 
 @kept
@@ -113,13 +113,13 @@ def density_of(model: Model) -> Density:
         whitened=len(names) > _MOST_PILOTED,
         log_prior=log_prior,
         log_likelihood=log_likelihood,
-        around=around,
-        means=lambda z: means_at(model, constrain(z)),
         prior_draw=prior_draw,
         constrain=constrain,
         unconstrain=unconstrain,
         names=names,
         batches=batches(model.forward),
+        means=lambda z: means_at(model, constrain(z)),
+        around=around,
     )
 
 
@@ -150,8 +150,9 @@ def height_program(density: Density) -> Callable[..., Heights]:
 
     def many(z: jax.Array, means: Data, valid: jax.Array, data: Data) -> Heights:
         def one(at: tuple[jax.Array, Data, jax.Array]) -> Heights:
-            likelihood = density.around(*at, data)
-            return Heights(without_nan(density.log_prior(at[0])), without_nan(likelihood))
+            known, z = density.around, at[0]
+            likelihood = known(*at, data) if known else density.log_likelihood(z, data)
+            return Heights(without_nan(density.log_prior(z)), without_nan(likelihood))
 
         return jax.lax.map(one, (z, means, valid), batch_size=BATCH)
 

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.stats import gaussian_kde
 
 from emulator.core.errors import InputError, SolverError
-from emulator.fem.energy import displacement_gradient, potential_energy
+from emulator.fem.energy import potential_energy
 from emulator.fem.reactions import SupportForce, support_forces
 from emulator.geometry.facets import Cavity
 from emulator.scenes.loads.force import MN_PER_N
@@ -81,7 +81,7 @@ def field_errors(
     err_R, max_R : the error (r,) in the force of each of the ``supports``, and the largest force ()
         of the reference, N; absent without any.
     """
-    H, H_reference = displacement_gradient(scene, u), displacement_gradient(scene, reference)
+    H, H_reference = scene.gradients(u), scene.gradients(reference)
     I1, I1_reference = (
         2.0 * jnp.trace(h, axis1=-2, axis2=-1) + jnp.sum(h * h, (-2, -1)) for h in (H, H_reference)
     )

@@ -55,7 +55,7 @@ import numpy as np
 from emulator.core.errors import InputError
 from emulator.fem.assembly import System
 from emulator.fem.compiled import compiled, cond, is_traced, one_by_one, while_loop
-from emulator.fem.energy import at_points, displacement_gradient, require_shape, volume_ratio
+from emulator.fem.energy import at_points, require_shape, volume_ratio
 from emulator.fem.formulations.displacement import UNBALANCED
 from emulator.fem.linear import Outcome
 from emulator.fem.load_stepping import LoadStepping
@@ -167,7 +167,7 @@ def invariants(
         isochoric = 1.0 + strain.isochoric_I4f_minus_1
         return J, I1, jnp.fmax(jnp.vdot(fibre, fibre), isochoric)
 
-    return at_points(measures, displacement_gradient(scene, u), scene.tissue_at(theta))
+    return at_points(measures, scene.gradients(u), scene.tissue_at(theta))
 
 
 class Distance(NamedTuple):

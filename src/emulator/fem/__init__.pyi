@@ -1,8 +1,8 @@
 from .campaign import Runs, run_campaign
 from .campaign.designs import design, sobol, uniform
 from .campaign.store import read_runs
-from .energy import displacement_gradient, potential_energy, strain_energy
-from .fields import element_fields
+from .energy import potential_energy, strain_energy
+from .fields import displacement_gradient, element_fields
 from .newton import NewtonOptions
 from .simulator import Simulator
 from .solution import Solution, Status

@@ -36,7 +36,6 @@ from emulator.fem.energy import (
     DeadForce,
     at_points,
     dead_force,
-    displacement_gradient,
     energy_of_gradient,
     force_on_body,
     law_gradients,
@@ -142,7 +141,7 @@ class System:
 
     def internal_energy(self, u: jax.Array, theta: jax.Array) -> jax.Array:
         """Return the elastic energy of the body and its springs, mN mm."""
-        energy = energy_of_gradient(self.scene, displacement_gradient(self.scene, u), theta)
+        energy = energy_of_gradient(self.scene, self.scene.gradients(u), theta)
         values = self.scene.resolve(theta)
         return sum((spring.total(u, values) for spring in self.springs), energy)
 

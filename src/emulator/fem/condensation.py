@@ -43,7 +43,6 @@ import numpy as np
 
 from emulator.fem.energy import (
     at_points,
-    displacement_gradient,
     nodal_vectors,
     pair_matrices,
     point_energy,
@@ -259,4 +258,4 @@ def block_volume(scene: Scene) -> jax.Array:
 
 def block_gradients(scene: Scene, u: jax.Array) -> jax.Array:
     """Return the displacement gradient (b, q, 3, 3) at the blocks' points."""
-    return scene.blocks.gather(displacement_gradient(scene, u))
+    return scene.blocks.gather(scene.gradients(u))

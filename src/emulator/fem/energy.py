@@ -42,7 +42,9 @@ Energy = Callable[[jax.Array, jax.Array], jax.Array]
 
 
 def require_rest(scene: ForwardProblem) -> None:
-    """Raise :class:`InputError` for a scene whose mesh is the shape under load."""
+    """Raise :class:`InputError` for a scene that relaxes, or whose mesh is the shape under load."""
+    if scene.relaxes:
+        raise InputError(f"scene '{scene.name}' has viscosity: follow it through Simulator.path")
     if scene.loaded_by:
         raise InputError(
             f"scene '{scene.name}' is known under load (loaded_by), and this needs a scene at "
@@ -54,11 +56,6 @@ def require_shape(scene: Scene, name: str, array: jax.Array, shape: tuple[int, .
     """Raise :class:`InputError` unless ``array`` has the ``shape``."""
     if array.shape != shape:
         raise InputError(f"scene '{scene.name}': {name} has shape {array.shape}; expected {shape}")
-
-
-def displacement_gradient(scene: Scene, u: jax.Array) -> jax.Array:
-    """Return ``H = du/dX`` at every quadrature point, (m, q, 3, 3), from ``u`` (n, 3) in mm."""
-    return scene.gradients(u)
 
 
 def volume_ratio(scene: ForwardProblem, u: jax.Array) -> jax.Array:
@@ -122,14 +119,6 @@ def mean_change(H: jax.Array, weights: jax.Array, barriers: Barriers | None = No
     return jnp.vdot(weights, J_minus_1) / jnp.sum(weights)
 
 
-def with_mean_dilatation(
-    H: jax.Array, weights: jax.Array, barriers: Barriers | None = None
-) -> jax.Array:
-    """Return the displacement gradients (q, 3, 3) of one block, scaled to the block's mean J."""
-    change = mean_change(H, weights, barriers)
-    return jax.vmap(lambda h: with_volume_change(h, change, barriers))(H)
-
-
 def nodal_vectors(blocks: Blocks, P: jax.Array) -> jax.Array:
     """Return nodal forces (b, a, 3) in mN of the blocks from ``P = dW/dH`` (b, q, 3, 3) in kPa."""
     return jnp.einsum("bq,bqij,bqaj->bai", blocks.weights, P, blocks.gradients)
@@ -181,9 +170,7 @@ def pair_products(pairs: jax.Array, local: jax.Array) -> jax.Array:
 
 def strain_energy(scene: Scene, barriers: Barriers | None = None) -> Energy:
     """Return ``(u, theta) -> int W dX`` in mN mm."""
-    return lambda u, theta: energy_of_gradient(
-        scene, displacement_gradient(scene, u), theta, barriers
-    )
+    return lambda u, theta: energy_of_gradient(scene, scene.gradients(u), theta, barriers)
 
 
 def energy_of_gradient(
@@ -222,14 +209,19 @@ def one_of_each[A: (jax.Array, np.ndarray)](points: np.ndarray, field: A) -> A:
 
 def law_gradients(scene: Scene, u: jax.Array) -> jax.Array:
     """Return the displacement gradients (b, q, 3, 3) that the law sees at ``u`` (n, 3) mm."""
-    return _seen_by_law(scene, displacement_gradient(scene, u))
+    return _seen_by_law(scene, scene.gradients(u))
 
 
 def _seen_by_law(scene: Scene, H: jax.Array, barriers: Barriers | None = None) -> jax.Array:
     H = scene.blocks.gather(H)
     if scene.dilatation == "pointwise":
         return H
-    return jax.vmap(lambda h, w: with_mean_dilatation(h, w, barriers))(H, scene.blocks.weights)
+
+    def to_mean_volume(H: jax.Array, weights: jax.Array) -> jax.Array:
+        change = mean_change(H, weights, barriers)
+        return jax.vmap(lambda h: with_volume_change(h, change, barriers))(H)
+
+    return jax.vmap(to_mean_volume)(H, scene.blocks.weights)
 
 
 def spring_terms(scene: Scene) -> list[LocalTerm]:

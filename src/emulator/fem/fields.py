@@ -8,6 +8,7 @@ with :math:`P_a` the stress that loads add, of muscle or as the tissue lies.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
@@ -17,13 +18,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.fem.compiled import compiled
-from emulator.fem.energy import at_points, displacement_gradient, energy_of_gradient
+from emulator.fem.energy import at_points, energy_of_gradient
 from emulator.geometry.fibres import unit
 from emulator.mechanics.kinematics import determinant
 from emulator.scenes.tissue import stiffness_of
 
 if TYPE_CHECKING:
     from emulator.scenes.scene import Scene
+
+
+def displacement_gradient(scene: Scene, u: jax.Array) -> jax.Array:
+    """Return ``du/dX`` (m, q, 3, 3) of ``u`` (n, 3) mm; deprecated, use ``Scene.gradients``."""
+    text = "em.fem.displacement_gradient goes in 0.11; write scene.gradients(u)"
+    warnings.warn(text, DeprecationWarning, stacklevel=2)
+    return scene.gradients(u)
 
 
 def element_fields(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, np.ndarray]:
@@ -63,7 +71,7 @@ def element_means(scene: Scene) -> Callable[[jax.Array, jax.Array], dict[str, ja
 
 def _means(scene: Scene, u: jax.Array, theta: jax.Array) -> dict[str, jax.Array]:
     """Return the means at one displacement and theta."""
-    H = displacement_gradient(scene, u)
+    H = scene.gradients(u)
     F = H + jnp.eye(3, dtype=H.dtype)
     J = at_points(determinant, F)
     P = _first_piola(scene, H, theta)

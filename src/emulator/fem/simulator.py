@@ -1,12 +1,7 @@
 """The FEM simulator: the displacement as a differentiable function of theta.
 
-From the call to the equation, a reader goes through the files in this order:
-:mod:`~emulator.fem.simulator` checks the arguments and compiles the solve
-(:mod:`~emulator.fem.compiled`), :mod:`~emulator.fem.fallbacks` tries strategies one after the
-other, :mod:`~emulator.fem.load_stepping` chooses load factors, :mod:`~emulator.fem.newton` iterates
-at one of them, :mod:`~emulator.fem.assembly` has residual and tangent, and
-:mod:`~emulator.fem.energy` the strain energy of the law. Derivatives are those of the equilibrium
-(:mod:`~emulator.fem.derivatives`), not of the iterations.
+ARCHITECTURE.md lists the files between a call and its equation, in reading order. Derivatives are
+those of the equilibrium (:mod:`~emulator.fem.derivatives`), not of the iterations.
 """
 
 from __future__ import annotations
@@ -15,6 +10,8 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import cached_property
+from importlib import import_module
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -145,19 +142,23 @@ class Simulator(TableRepr):
 
         Fields of the solution gain an axis m. Each equilibrium is sought from the extrapolation of
         the two before it, and the first one (and one after a body at rest) from rest: a curve of
-        many points costs a few iterations a point. Differentiable as :meth:`solve` is.
+        many points costs a few iterations a point. Differentiable as :meth:`solve` is. One
+        with viscosity goes through the times in theta (:mod:`emulator.viscosity.body`).
 
         Raises
         ------
         InputError
-            ``thetas`` has the wrong shape, or float64 is off.
+            ``thetas`` has the wrong shape, its times fall, or float64 is off.
         """
         thetas = jnp.asarray(thetas, dtype=float)
-        if thetas.ndim != 2 or not len(thetas):
+        if thetas.ndim != 2 or not len(thetas) or thetas.shape[1] != len(self.scene.parameters):
             raise InputError(
                 f"scene '{self.scene.name}': path has shape {thetas.shape}; expected "
                 f"(m, {len(self.scene.parameters)})"
             )
+        if self.scene.relaxes:
+            through_time = import_module("emulator.viscosity.body").through_time  # a room
+            return cast(Solution, through_time(self.scene, self.options, thetas))
 
         def next_point(
             last_two: tuple[jax.Array, jax.Array], theta: jax.Array

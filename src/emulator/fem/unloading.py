@@ -46,7 +46,7 @@ from emulator.fem.derivatives import (
     require_finite,
     sensitivities,
 )
-from emulator.fem.energy import at_points, displacement_gradient, require_rest, require_shape
+from emulator.fem.energy import at_points, require_rest, require_shape
 from emulator.fem.fallbacks import find_equilibrium
 from emulator.fem.inverse_motion import InverseSystem, carried_back
 from emulator.fem.newton import NewtonOptions, largest_admissible
@@ -326,7 +326,7 @@ METHODS: dict[str, RootFinder] = {"inverse": _by_inverse_motion, "fixed_point": 
 
 def tissue_at_rest(scene: Scene, w: jax.Array, theta: jax.Array) -> Tissue:
     """Return the material data (m, q, ...) on the mesh x + w, directions carried back."""
-    tissue, h = scene.tissue_at(theta), displacement_gradient(scene, w)
+    tissue, h = scene.tissue_at(theta), scene.gradients(w)
     return tissue._replace(directions=at_points(carried_back, h, tissue.directions))
 
 
@@ -366,7 +366,7 @@ def system_at_rest(system: System, w: jax.Array, theta: jax.Array) -> System:
     They live as long as the function that makes them, and nothing is checked.
     """
     scene, tissue = system.scene, tissue_at_rest(system.scene, w, theta)
-    directions, h = tissue.directions, displacement_gradient(scene, w)
+    directions, h = tissue.directions, scene.gradients(w)
     fibres = directions if directions is None or directions.ndim == 3 else directions[:, :, 0]
     mesh = unchecked(scene.mesh, nodes=scene.mesh.nodes + w)
     gradients, weights = _shape_functions_at_rest(scene.discretisation, h)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar
@@ -44,10 +45,12 @@ class ForwardProblem(TableRepr):
 
     solved_by : the module and the name of the class or function that makes its solver.
     outside : whether a program of somebody else's solves it.
+    timed : whether times are a load's, in theta, where it has viscosity.
     """
 
     solved_by: ClassVar[str] = "emulator.fem.simulator:Simulator"
     outside: ClassVar[bool] = False
+    timed: ClassVar[bool] = True
 
     name: str
     law: Law
@@ -61,6 +64,7 @@ class ForwardProblem(TableRepr):
     regions: np.ndarray | None = None
     loaded_by: Mapping[str, str] = MappingProxyType({})
     table: Cells | None = None
+    viscosity: Any = None
 
     @property
     def usual_map(self) -> str:
@@ -76,6 +80,11 @@ class ForwardProblem(TableRepr):
     def learned_in_box(self) -> bool:
         """Say whether a part of the problem was learned inside the box of theta only."""
         return False
+
+    @property
+    def relaxes(self) -> bool:
+        """Say whether the law alone gives no stress: FEM follows the problem through times."""
+        return self.viscosity is not None
 
     @property
     @abstractmethod
@@ -163,12 +172,30 @@ class ForwardProblem(TableRepr):
         owners = {q.name: (q, f"law '{self.law.name}'") for q in self.law.quantities}
         owners |= {q.name: (q, "a region") for q in stiffness_quantities(self.regions, None)}
         add_owners(owners, "the fibres'", self.angles)
+        if self.viscosity is not None:
+            add_owners(owners, "the scene's", [self.viscosity])
+            if self.timed:
+                owners["time"] = Quantity("time", "s", 0.0, low_admitted=True), "viscosity"
         return owners
 
     @property
     def tissue_parameters(self) -> tuple[str, ...]:
         """Names of the parameters that are of the material, wherever it is."""
-        return self.law.parameters
+        of_viscosity = () if self.viscosity is None else self.viscosity.quantities
+        return (*self.law.parameters, *(quantity.name for quantity in of_viscosity))
+
+    def _check_viscosity(self) -> None:
+        """Keep viscosity, also of a scene file's table; refuse what time does not go with."""
+        if self.viscosity is None:
+            return
+        viscosity_of = import_module("emulator.viscosity.series").viscosity_of  # a room
+        object.__setattr__(self, "viscosity", viscosity_of(self.viscosity))
+        if not self.law.objective:
+            raise InputError(f"law '{self.law.name}' is of small strains; viscosity needs another")
+        if self.loaded_by:
+            raise InputError("a mesh is unloaded without time; leave out loaded_by or viscosity")
+        if self.timed and "time" in self.constants:
+            raise InputError("'time' is a constant, so nothing goes on; make it a parameter, in s")
 
     def _check_directions(self, count: int, points: int, loads: Sequence[Load] = ()) -> None:
         """Refuse directions and angles that do not fit; keep them as frozen arrays.

@@ -69,6 +69,8 @@ class SceneData(ForwardProblem):
         load parameter of theta the name of the parameter or constant that holds its value there,
         ``{"pressure": "imaged"}``. A simulator then unloads and loads
         (:mod:`emulator.fem.loaded`), and displacements are those from the mesh.
+    viscosity : how the law's stress relaxes (:mod:`emulator.viscosity`), as a scene file's table;
+        theta then has a ``time`` in s, through which ``Simulator.path`` goes.
     """
 
     name: str
@@ -87,11 +89,13 @@ class SceneData(ForwardProblem):
     angles: tuple[FibreAngles, ...] = ()
     loaded_by: Mapping[str, str] = field(default_factory=dict)
     stiffness_modes: np.ndarray | None = None
+    viscosity: Any = None
 
     def __post_init__(self) -> None:
         for name in ("constants", "origin", "loaded_by"):
             object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
         try:
+            self._check_viscosity()
             self._check_tissue()
             prescribed = self.prescribed  # refuses supports that contradict one another
             self._check_parameters()
@@ -125,7 +129,7 @@ class SceneData(ForwardProblem):
         """Entries of theta that belong to loads or move supports; the others are the body's."""
         loads = (load for load in self.loads if not load.shared)
         names = {quantity.name for load in loads for quantity in load.quantities}
-        names |= set(self.prescribed.per_unit)
+        names |= {*self.prescribed.per_unit, *(("time",) if self.viscosity else ())}
         return tuple(parameter.name for parameter in self.parameters if parameter.name in names)
 
     @override

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -22,13 +22,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.core.cells import BRANCH, LOADING, PROTOCOL, UNLOADING, Cells, read_cells
-from emulator.core.errors import InputError, check_known
+from emulator.core.errors import InputError
 from emulator.core.units import with_unit
 from emulator.geometry.mesh import Mesh, frozen_array
 from emulator.mechanics.laws import Law
 from emulator.mechanics.laws.law import law_identity
 from emulator.scenes.fibre_rules import FibreRule
-from emulator.scenes.forward_problem import ForwardProblem, Owners, add_owners
+from emulator.scenes.forward_problem import ForwardProblem
 from emulator.scenes.identity import Identity, described_fields, fingerprint
 from emulator.scenes.parameter_space import Parameter
 from emulator.scenes.scene import with_mesh
@@ -117,6 +117,8 @@ class Specimen(ForwardProblem):
 
     solved_by = "emulator.specimens.homogeneous:homogeneous"
     usual_map = "incompressible"
+    relaxes = False  # its map follows the tests through their times
+    timed = False
 
     @property
     def learned_in_box(self) -> bool:
@@ -124,10 +126,6 @@ class Specimen(ForwardProblem):
         return self.grips is not None and self.grips.learned is not None
 
     def __post_init__(self) -> None:
-        if isinstance(self.viscosity, Mapping):
-            for word in self.viscosity:
-                check_known(word, [f.name for f in fields(Viscosity)], "viscosity: entry")
-            object.__setattr__(self, "viscosity", Viscosity(**self.viscosity))
         H, free, pulls, tests = self.states
         count = len(free)
         rows = MappingProxyType({name: frozen_array(k, int) for name, k in tests.items()})
@@ -141,6 +139,7 @@ class Specimen(ForwardProblem):
         if self.tube is not None:
             object.__setattr__(self, "regions", self.tube.regions(count))
         try:
+            self._check_viscosity()
             self._check_directions(count, 1)
             self._check_parameters()
             if self.grips is not None and self.homogeneous:
@@ -150,7 +149,7 @@ class Specimen(ForwardProblem):
                     "grips move a specimen; with applied stresses they are not supported: leave "
                     "out one of the two"
                 )
-            self._check_viscosity()
+            self._check_times()
         except InputError as error:
             raise InputError(f"scene '{self.name}': {error}") from error
 
@@ -162,30 +161,17 @@ class Specimen(ForwardProblem):
         rows = {name: of_test[::points] // points for name, of_test in tests.items()}
         return States(H[::points], free[::points], pulls[::points], rows)
 
-    def _check_viscosity(self) -> None:
-        """Refuse viscosity without times, of a law of small strains, or with grips."""
+    def _check_times(self) -> None:
+        """Refuse viscosity without times, or with grips."""
         if self.viscosity is None:
             object.__setattr__(self, "times", None)
             return
         if self.times is None:
             raise InputError(f"viscosity needs the time of each state; give '{TIME}', in s")
-        if not self.law.objective:
-            raise InputError(f"law '{self.law.name}' is of small strains; viscosity needs another")
         if self.grips is not None:
             raise InputError("grips are solved without time; leave out viscosity or grips")
         object.__setattr__(self, "times", frozen_array(self.times))
         check_times(self.times, self.measured.protocols, len(self.measured.free))
-
-    def _owners(self) -> Owners:
-        owners = super()._owners()
-        add_owners(owners, "the scene's", [] if self.viscosity is None else [self.viscosity])
-        return owners
-
-    @property
-    def tissue_parameters(self) -> tuple[str, ...]:
-        """Names of the parameters of the law and of its viscosity."""
-        of_viscosity = () if self.viscosity is None else self.viscosity.quantities
-        return (*self.law.parameters, *(quantity.name for quantity in of_viscosity))
 
     @cached_property
     def histories(self) -> Histories:

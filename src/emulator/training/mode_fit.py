@@ -53,7 +53,6 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from emulator.core.display import counting
 from emulator.fem.campaign import Runs
-from emulator.fem.energy import displacement_gradient
 from emulator.scenes.scene import Scene
 from emulator.surrogates.network import Network
 from emulator.surrogates.network.pignn import MLP
@@ -107,7 +106,7 @@ def mean_square_gradient(scene: Scene, difference: jax.Array) -> jax.Array:
         difference is enough.
     """
     weights = scene.discretisation.weights
-    H = jax.vmap(lambda d: displacement_gradient(scene, d))(difference)
+    H = jax.vmap(lambda d: scene.gradients(d))(difference)
     squares = jnp.sum(H * H, axis=(-2, -1))
     return jnp.sum(weights * jnp.mean(squares, axis=0)) / jnp.sum(weights)
 

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emulator.fem import Simulator
-from emulator.fem.energy import displacement_gradient, strain_energy
+from emulator.fem.energy import strain_energy
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
@@ -348,7 +348,7 @@ def _by_fem(law: str) -> tuple[np.ndarray, np.ndarray]:
     scene = tetrahedra(pulled(law, _STRETCHES))
     theta = jnp.array([next(iter(SOLUTIONS[law][1].values()))])
     u = Simulator(scene).solve(theta).require_converged(scene.name).displacement
-    H = np.asarray(displacement_gradient(scene, u))[:, 0]
+    H = np.asarray(scene.gradients(u))[:, 0]
     # The force on the corner at e_x is the stress times the volume, over 1 mm.
     force = np.asarray(jax.grad(strain_energy(scene))(u, theta))[scene.mesh.elements[:, 1], 0]
     volume = scene.discretisation.weights.sum(axis=1)

@@ -27,14 +27,14 @@ decades (``tests/emulator/viscosity/test_series.py``).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.core.errors import InputError
+from emulator.core.errors import InputError, check_known
 from emulator.mechanics.laws.law import Quantity, number
 
 KINDS = ("prony", "spectrum")
@@ -107,3 +107,12 @@ class Viscosity:
         return Series(
             relaxed * left, jnp.stack([jnp.asarray(values[f"tau_{k}"], float) for k in terms])
         )
+
+
+def viscosity_of(entries: Viscosity | Mapping[str, Any]) -> Viscosity:
+    """Return the viscosity of the table of a scene file; one that is made already as it is."""
+    if isinstance(entries, Viscosity):
+        return entries
+    for word in entries:
+        check_known(word, [field.name for field in fields(Viscosity)], "viscosity: entry")
+    return Viscosity(**entries)

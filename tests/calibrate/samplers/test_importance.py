@@ -29,7 +29,6 @@ def density(log_likelihood, size, **more):
     likelihood = lambda z, data: log_likelihood(z)
     return Density(
         lambda z, data: prior(z) + log_likelihood(z), size, size > 1, 2, prior, likelihood,
-        lambda z, means, valid, data: likelihood(z, data), lambda z: ({}, np.ones(len(z), bool)),
         lambda key: SD * jax.random.normal(key, (size,)),
         lambda z: {f"z{i}": z[:, i] for i in range(size)},
         lambda draw: jnp.stack(list(draw.values())),

@@ -38,8 +38,6 @@ def density(log_density, size, spread=3.0):
         lambda z, data: log_density(z), size, size > 1, 1,
         lambda z: jnp.zeros(()),
         lambda z, data: log_density(z),
-        lambda z, means, valid, data: log_density(z),
-        lambda z: ({}, np.ones(len(z), bool)),
         lambda key: spread * jax.random.normal(key, (size,)),
         lambda z: {f"z{i}": z[:, i] for i in range(size)},
         lambda draw: jnp.stack(list(draw.values())),

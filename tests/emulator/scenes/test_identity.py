@@ -262,6 +262,9 @@ def piece(**changes):
     for name, value in ("angle", entries.get("angles")), ("imaged", entries.get("loaded_by")):
         if value:
             entries["constants"] = entries["constants"] | {name: 0.5}
+    if entries.get("viscosity"):
+        entries["constants"] = entries["constants"] | {"relaxation_1": 0.5, "tau_1": 1.0}
+        entries["parameters"] = (*entries["parameters"], Parameter("time", "s", 0.0, 1.0))
     return replace(block(), **entries)
 
 
@@ -304,6 +307,7 @@ FIELDS = {
     "angles": (TURNED,),
     "dilatation": "patch",
     "loaded_by": {"pressure": "imaged"},
+    "viscosity": {"kind": "prony"},
 }
 FIELDS_OF_SPECIMENS = {
     "states": states({"stretch_x": np.array([1.0, 1.1]), "shear_xy": np.array([0.0, 0.2])}),

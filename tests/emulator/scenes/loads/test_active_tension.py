@@ -11,7 +11,6 @@ import emulator as em
 from emulator.core.errors import InputError
 from emulator.fem.assembly import System
 from emulator.fem.energy import (
-    displacement_gradient,
     local_terms,
     potential_energy,
     strain_energy,
@@ -48,7 +47,7 @@ def muscle(transverse=0.0, dilatation="pointwise") -> Scene:
 
 def by_invariants(scene, u, tension, transverse):
     """The integral of T/2 [(I4f - 1) + eta (I4s + I4n - 2)], mN mm."""
-    F = displacement_gradient(scene, u) + jnp.eye(3)
+    F = scene.gradients(u) + jnp.eye(3)
     I1 = jnp.einsum("mqij,mqij->mq", F, F)
     C = jnp.einsum("mqki,mqkj->mqij", F, F)
     I4f = jnp.einsum("mqi,mqij,mqj->mq", scene.fibres, C, scene.fibres)
