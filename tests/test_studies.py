@@ -29,6 +29,7 @@ QUICK = {
     "certificate": "--quick",
     "cohorts": "--data MEASURED --quick",
     "fem_speed": "--quick",
+    "filling_rates": "--quick",
     "human_heart": "--data MEASURED/human_heart --quick",
     "human_myocardium": "--data MEASURED/myocardium_tables --quick",
     "imaged_heart": "--quick",

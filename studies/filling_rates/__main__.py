@@ -1,0 +1,115 @@
+"""Twins of a ventricle that relaxes, filled at two rates: are their intervals right?
+
+    python -m studies.filling_rates [--quick]
+
+Twenty truths are drawn from the prior, volumes get noise, and each twin is calibrated by the loop
+without a box and certified by fresh runs of the same finite elements. Writes results.json and
+filling_rates.png.
+"""
+
+import tempfile
+from functools import partial
+from pathlib import Path
+from time import perf_counter
+
+import jax.numpy as jnp
+import numpy as np
+from studies.common.figures import BLUE, GREEN, ORANGE, pyplot
+from studies.common.output import Case, Results, parser, run, save
+from studies.common.processes import calibrate
+from studies.filling_rates import filling
+
+HERE = Path(__file__).parent
+TWINS, QUICK = 20, 1
+NOISE = 0.3  # mL
+LOG_NORMAL = {"a": (0.32, 0.4, "kPa"), "a_f": (5.6, 0.4, "kPa"), "tau_1": (1.0, 0.7, "s")}
+RELAXED = (0.05, 0.95)
+
+
+def problem(folder: Path) -> Path:
+    """The scene file of the solver, beside a copy of its function."""
+    (folder / "filling.py").write_text((HERE / "filling.py").read_text())
+    lines = ["[solver]", 'kind = "python"', 'function = "filling.py:solve"']
+    for name in filling.OF_TISSUE:
+        lines.append(f"[parameters.{name}]")
+        if name in LOG_NORMAL:
+            median, log_sd, unit = LOG_NORMAL[name]
+            lines += [f'unit = "{unit}"', f"median = {median}", f"log_sd = {log_sd}"]
+        else:
+            lines.append(f"range = {list(RELAXED)}")
+    size = len(filling.RATES) * (3 + len(filling.HELD))
+    lines += ["[outputs.volume]", 'unit = "mL"', f"size = {size}"]
+    (folder / "filling.toml").write_text("\n".join(lines))
+    return folder / "filling.toml"
+
+
+def truth_of(seed: int) -> dict[str, float]:
+    """A draw of the prior."""
+    rng = np.random.default_rng([seed, 88])
+    drawn = {n: m * np.exp(sd * rng.normal()) for n, (m, sd, _) in LOG_NORMAL.items()}
+    drawn["relaxation_1"] = rng.uniform(*RELAXED)
+    return {name: float(f"{drawn[name]:.4g}") for name in filling.OF_TISSUE}
+
+
+def twin(seed: int) -> Case:
+    """The posterior and verdict of one twin, and in which intervals its truth is."""
+    truth, begin = truth_of(seed), perf_counter()
+    with tempfile.TemporaryDirectory() as place:
+        words = [problem(Path(place)).name, "--truth", *(f"{n}={v}" for n, v in truth.items())]
+        words += ["--observe", "volume", "--noise", f"volume={NOISE}", "--seed", str(seed)]
+        words += ["--bounded", "relaxation_1", "--out", "run"]
+        told = calibrate(Path(place), "infer", *words)
+    rows = {name: told["parameters"][name] for name in truth}
+    return {
+        "truth": truth,
+        "mean": {name: row["mean"] for name, row in rows.items()},
+        "sd": {name: row["sd"] for name, row in rows.items()},
+        "inside": {n: row["low"] <= truth[n] <= row["high"] for n, row in rows.items()},
+        "verdict": told["verdict"],
+        "runs": told["rounds"][-1]["runs"],
+        "seconds": round(perf_counter() - begin, 1),
+    }
+
+
+def draw(cases: list[Case], path: Path) -> None:
+    """Volumes of one body at both rates, and each twin's estimates over its truths."""
+    figure, axes = pyplot().subplots(1, 3, figsize=(12.0, 3.8), layout="constrained")
+    tissue = dict.fromkeys(filling.OF_TISSUE, 0.5) | {n: m for n, (m, _, _) in LOG_NORMAL.items()}
+    for rate, colour in zip(filling.RATES.values(), (BLUE, ORANGE), strict=True):
+        pressures, times = filling.path(rate)
+        at = [tissue | {"pressure": p, "time": t} for p, t in zip(pressures, times, strict=True)]
+        thetas = jnp.array([[row[name] for name in filling.BODY.parameter_names] for row in at])
+        u = filling.SIMULATOR.path(thetas).displacement[:, filling.VOLUME.nodes]
+        volumes = [float(filling.VOLUME(*row)) for row in zip(u, thetas, strict=True)]
+        axes[0].plot(times, volumes, "o-", color=colour, ms=4, label=f"filled in {rate:g} s")
+    axes[0].set(xlabel="time (s)", ylabel="volume (mL)", xscale="log", title="one body")
+    axes[0].legend()
+    for axis, name in zip(axes[1:], ("relaxation_1", "tau_1"), strict=True):
+        for case in cases:
+            colour = GREEN if case["inside"][name] else ORANGE
+            at, half = case["truth"][name], 1.645 * case["sd"][name]
+            mean = case["mean"][name]
+            axis.plot([at, at], [max(mean - half, 1e-3), mean + half], color=colour, lw=1)
+            axis.plot(at, mean, "o", color=colour, ms=4)
+        axis.axline((0.5, 0.5), slope=1.0, color="0.6", lw=1, zorder=0)
+        axis.set(xlabel=f"{name}, truth", ylabel="mean and 90 %", title=name)
+    axes[2].set(xscale="log", yscale="log")
+    save(figure, path)
+
+
+def main() -> None:
+    """Run the study."""
+    arguments = parser(__doc__, HERE).parse_args()
+    results = Results(arguments.out, 0, again=arguments.again)
+    for seed in range(QUICK if arguments.quick else TWINS):
+        results.case(f"twin {seed}", partial(twin, seed))
+    cases = results.cases
+    inside = [yes for case in cases for yes in case["inside"].values()]
+    accepted = sum(case["verdict"] == "accepted" for case in cases)
+    print(f"{sum(inside)} of {len(inside)} inside their 90 %; {accepted} of {len(cases)} accepted")
+    results.write()
+    draw(cases, arguments.out / "filling_rates.png")
+
+
+if __name__ == "__main__":
+    run(main)
