@@ -221,7 +221,7 @@ def _seen_by_law(scene: Scene, H: jax.Array, barriers: Barriers | None = None) -
         change = mean_change(H, weights, barriers)
         return jax.vmap(lambda h: with_volume_change(h, change, barriers))(H)
 
-    return jax.vmap(to_mean_volume)(H, scene.blocks.weights)
+    return jax.vmap(to_mean_volume)(H, jnp.asarray(scene.blocks.weights))
 
 
 def spring_terms(scene: Scene) -> list[LocalTerm]:
