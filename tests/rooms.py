@@ -28,7 +28,7 @@ ROOMS = {
         "calibrate.statistical_model.gripped_fem",
         "calibrate.project.specimen",
     ),
-    "viscosity": ("emulator.viscosity", "calibrate.project.viscosity"),
+    "viscosity": ("emulator.viscosity", "emulator.fem.through_time", "calibrate.project.viscosity"),
     "fields": (
         "calibrate.measurements.frame_checks",
         "calibrate.fields",

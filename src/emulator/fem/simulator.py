@@ -143,7 +143,7 @@ class Simulator(TableRepr):
         Fields of the solution gain an axis m. Each equilibrium is sought from the extrapolation of
         the two before it, and the first one (and one after a body at rest) from rest: a curve of
         many points costs a few iterations a point. Differentiable as :meth:`solve` is. One
-        with viscosity goes through the times in theta (:mod:`emulator.viscosity.body`).
+        with viscosity goes through the times in theta (:mod:`emulator.fem.through_time`).
 
         Raises
         ------
@@ -157,7 +157,7 @@ class Simulator(TableRepr):
                 f"(m, {len(self.scene.parameters)})"
             )
         if self.scene.relaxes:
-            through_time = import_module("emulator.viscosity.body").through_time  # a room
+            through_time = import_module("emulator.fem.through_time").through_time  # a room
             return cast(Solution, through_time(self.scene, self.options, thetas))
 
         def next_point(

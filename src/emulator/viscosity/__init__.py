@@ -33,6 +33,6 @@ The stress of a step is therefore that of a hyperelastic law, with potential
 which equilibrium in free directions minimises, as it does without viscosity.
 
 :mod:`~emulator.viscosity.series` has the fractions and times, :mod:`~emulator.viscosity.overstress`
-the step, :mod:`~emulator.viscosity.body` the steps of a body, and :mod:`~emulator.viscosity.times`
-the times of a table.
+the step, :mod:`~emulator.viscosity.times` the times of a table, and
+:mod:`~emulator.fem.through_time` the steps of a body.
 """

@@ -12,9 +12,9 @@ from emulator.core.errors import InputError
 from emulator.fem.energy import potential_energy
 from emulator.fem.newton import NewtonOptions
 from emulator.fem.solution import Status
+from emulator.fem.through_time import StepLaw
 from emulator.geometry.generators.box import box
 from emulator.mechanics.kinematics import Strain
-from emulator.viscosity.body import StepLaw
 
 MU, G, TAU = 8.0, 0.5, 2.0
 OF_TISSUE = (
