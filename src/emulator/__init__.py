@@ -13,4 +13,4 @@ from emulator.core import machine  # noqa: F401 - float64, before JAX makes its 
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
-__version__ = "0.9.0"
+__version__ = "0.10.0"
