@@ -59,7 +59,7 @@ class Density(Target):
     unconstrain : (draw by name, each ()) -> z (p,).
     names : the names of the coordinates, (p,), in their order.
     batches : whether many evaluations at once are cheap, as they are where none solves FEM.
-    means : (z (s, p),) -> data without noise, (s, *shape) by name, and validity (s,).
+    means : (z (s, p),) -> data without noise, (s, ...) by name, and validity (s,).
     around : (z (p,), means, validity, data) -> (); log_likelihood where both are known, if it can.
     """
 
