@@ -93,7 +93,9 @@ def draw(cases: list[Case], path: Path) -> None:
             axis.plot(at, mean, "o", color=colour, ms=4)
         axis.axline((0.5, 0.5), slope=1.0, color="0.6", lw=1, zorder=0)
         axis.set(xlabel=f"{name}, truth", ylabel="mean and 90 %", title=name)
-    axes[2].set(xscale="log", yscale="log")
+    axes[2].set(xscale="log", yscale="log", ylim=(0.1, 6.0))
+    for along in (axes[2].xaxis, axes[2].yaxis):
+        along.set_minor_formatter("")
     save(figure, path)
 
 
