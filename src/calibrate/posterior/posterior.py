@@ -306,7 +306,8 @@ def make_tree(
     else:
         posterior_key, prior_key = jax.random.split(rng_key)
         rows, some = predictions.spread(draws)
-        at_some = None if means is None else {n: np.asarray(m)[:, rows] for n, m in means.items()}
+        means = predictions.means_of(model, draws) if means is None else means
+        at_some = {name: np.asarray(values)[:, rows] for name, values in means.items()}
         prior = predictions.prior_replicates(model, prior_key)
         likelihood = predictions.log_likelihood(model, draws, data, means)
         replicated = predictions.replicates(model, some, posterior_key, at_some)

@@ -56,6 +56,11 @@ class Prior(NamedTuple):
     data: dict[str, np.ndarray]
 
 
+def means_of(model: Model, draws: Draws) -> dict[str, np.ndarray]:
+    """Return data without noise at each draw, (chains, draws, *shape), by the forward map."""
+    return _unflat(means_at(model, _flat(draws))[0], draws)
+
+
 def log_likelihood(
     model: Model, draws: Draws, data: Mapping[str, Any], means: Draws | None = None
 ) -> dict[str, np.ndarray]:
@@ -67,8 +72,8 @@ def log_likelihood(
     means : data without noise (chains, draws, *shape), where the draws are not of the model's own
         posterior; by its forward map otherwise.
     """
-    program, at = _over_draws(model, _log_likelihood), _means(model, draws, means)
-    return _unflat(program((_flat(draws), at), dict(data)), draws)
+    at = _flat(means_of(model, draws) if means is None else means)
+    return _unflat(_over_draws(model, _log_likelihood)((_flat(draws), at), dict(data)), draws)
 
 
 @kept
@@ -84,7 +89,8 @@ def replicates(
 
     ``means`` as of :func:`log_likelihood`.
     """
-    return _unflat(_replicated(model, _flat(draws), _means(model, draws, means), rng_key), draws)
+    at = _flat(means_of(model, draws) if means is None else means)
+    return _unflat(_replicated(model, _flat(draws), at, rng_key), draws)
 
 
 def prior_replicates(model: Model, rng_key: jax.Array, count: int = REPLICATES) -> Prior:
@@ -118,12 +124,6 @@ def spread(draws: Draws, count: int = REPLICATES) -> tuple[np.ndarray, Draws]:
     count_per_chain = min(length, -(-count // chains))
     rows = np.linspace(0, length - 1, count_per_chain).astype(int)
     return rows, {name: np.asarray(values)[:, rows] for name, values in draws.items()}
-
-
-def _means(model: Model, draws: Draws, means: Draws | None) -> dict[str, Any]:
-    """Return data without noise (s, *shape) at all draws: those that are known, or the map's."""
-    flat = _flat(draws)
-    return means_at(model, flat)[0] if means is None else _flat(means)
 
 
 def _replicated(model: Model, draws: Draws, means: Draws, rng_key: jax.Array) -> dict[str, Any]:

@@ -140,8 +140,7 @@ class Heights(NamedTuple):
 
 def heights(density: Density, z: np.ndarray, data: Data) -> Heights:
     """Return the log densities at points z (s, p)."""
-    program = height_program(density)
-    return in_blocks(lambda block: program(block, *density.means(block), data), z)
+    return in_blocks(lambda block: height_program(density)(block, *density.means(block), data), z)
 
 
 @kept

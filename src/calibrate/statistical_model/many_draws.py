@@ -27,7 +27,7 @@ BATCH = 32  # points of a block that are vectorised
 
 
 class Predicting(Protocol):
-    """What a model (:class:`~calibrate.statistical_model.Model`) predicts with."""
+    """The part of :class:`~calibrate.statistical_model.Model` that predictions need."""
 
     @property
     def forward(self) -> ForwardMap:
@@ -58,16 +58,17 @@ def batches(forward: ForwardMap) -> bool:
 def in_blocks(program: Callable[..., Any], *points: Any) -> Any:
     """Return ``program`` of arrays (s, ...), or trees of them, called with padded blocks."""
     count = len(jax.tree.leaves(points)[0])
-
-    def block(k: int, x: np.ndarray) -> jax.Array:
-        rows = np.asarray(x[k : k + BLOCK])
-        return jnp.asarray(np.concatenate([rows, np.repeat(rows[-1:], BLOCK - len(rows), axis=0)]))
-
-    parts = [
-        jax.tree.map(np.asarray, program(*jax.tree.map(lambda x, k=k: block(k, x), points)))
+    blocks = (
+        jax.tree.map(lambda x, k=k: _padded(np.asarray(x[k : k + BLOCK])), points)
         for k in range(0, count, BLOCK)
-    ]
+    )
+    parts = [jax.tree.map(np.asarray, program(*block)) for block in blocks]
     return jax.tree.map(lambda *arrays: np.concatenate(arrays)[:count], *parts)
+
+
+def _padded(rows: np.ndarray) -> jax.Array:
+    """Return rows (s, ...) and the last of them again, (BLOCK, ...)."""
+    return jnp.asarray(np.concatenate([rows, np.repeat(rows[-1:], BLOCK - len(rows), axis=0)]))
 
 
 def means_at(
@@ -75,7 +76,7 @@ def means_at(
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Return data without noise at draws, (s, *shape) by observation, and their validity (s,).
 
-    Where the forward map has no answer the data are 0.
+    Data are 0 where the forward map has no answer.
 
     draws : values (s,) of the unknowns by name; others are left alone.
     """
@@ -93,9 +94,7 @@ def _of_block(model: Predicting, rows: np.ndarray) -> tuple[dict[str, np.ndarray
     if isinstance(model.forward, FEMForward):
         answers = _by_solves(model, model.forward, jnp.asarray(rows))
     else:
-        padded = np.concatenate([rows, np.repeat(rows[-1:], BLOCK - len(rows), axis=0)])
-        size = _batch(model)
-        answers = _program(model)(jnp.asarray(padded), -(-len(rows) // size))
+        answers = _program(model)(_padded(rows), -(-len(rows) // _batch(model)))
     return jax.tree.map(lambda values: np.asarray(values)[: len(rows)], answers)
 
 

@@ -17,7 +17,7 @@ time, with the memory,
           \frac{d(s, A)(m_{k-1}, \theta)}{d\theta}\right], \qquad
     m_k = m(m_{k-1}, u_k, \theta) .
 
-With mean dilatation the law, and so the memory, sees the element's mean change of volume.
+The law, and so the memory, sees the mean change of volume of the block where dilatation is shared.
 
 Errors are those of the step, which takes the isochoric stress to go straight in time: of second
 order in its length, and none of one in which nothing moves.
@@ -173,7 +173,7 @@ def through_time(scene: Scene, options: NewtonOptions, thetas: jax.Array) -> Sol
         state: tuple[jax.Array, Memory, jax.Array], row: tuple[jax.Array, jax.Array]
     ) -> tuple[tuple[jax.Array, Memory, jax.Array], Solution]:
         (u, memory, status), (theta, interval) = state, row
-        # From rest the start stays at rest: supports that jump alone would invert elements.
+        # A body at rest starts from there: supports that jump alone would invert elements.
         start = jnp.where(jnp.any(u != 0.0), scene.on_supports(u, theta), 0.0)
         whole = _before_step(system, memory, theta, interval)
         solution = equilibrium(whole, jax.lax.stop_gradient(start))

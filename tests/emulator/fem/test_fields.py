@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
+import emulator as em
 from emulator.fem.fields import _first_piola, element_fields
 from emulator.mechanics.laws import find_law
 from emulator.scenes import Parameter, Scene, Support
@@ -123,3 +124,10 @@ def test_mean_dilatation_on_quadratic_elements():
     np.testing.assert_allclose(tau, tau.T, atol=1e-11)
     sigma = element_fields(scene, u, theta)["cauchy_stress"]
     np.testing.assert_array_equal(sigma, np.swapaxes(sigma, 1, 2))
+
+
+def test_the_old_name_of_gradients_warns(beam):
+    u = 0.01 * np.ones((beam.node_count, 3))
+    with pytest.warns(DeprecationWarning, match=r"goes in 0.11; write scene.gradients\(u\)"):
+        H = em.fem.displacement_gradient(beam, u)
+    np.testing.assert_array_equal(H, beam.gradients(u))
