@@ -192,7 +192,8 @@ def test_log_normal_is_cut_where_asked():
 
 
 def test_standardised_coordinates_change_no_density():
-    for prior in (dist.Normal(75.0, 3.0), dist.LogNormal(4.0, 0.1)):
+    wide = cal.priors.log_normal(2.2, 1.55, low=0.007, high=710.0)
+    for prior in (dist.Normal(75.0, 3.0), dist.LogNormal(4.0, 0.1), wide):
         around = standardised(prior)
         x = prior.sample(jax.random.key(1), (5,))
         np.testing.assert_array_equal(around.log_prob(x), prior.log_prob(x))
@@ -201,6 +202,28 @@ def test_standardised_coordinates_change_no_density():
         assert float(jnp.std(z)) == pytest.approx(1.0, abs=0.1)
     box = dist.Uniform(1.0, 2.0)
     assert standardised(box) is box
+
+
+@pytest.mark.parametrize(
+    "prior",
+    [
+        cal.priors.log_normal(2.2, 1.55, low=0.007, high=710.0),
+        cal.priors.log_normal(11.5, 1.6),
+        cal.priors.truncated_normal(1e4, 10.0, 0.0, 1e9),
+        dist.LogUniform(1e-4, 1e4),
+        dist.Beta(2.0, 200.0),
+        dist.HalfNormal(1e-3),
+        dist.Uniform(-3.0, 1e6),
+    ],
+)
+def test_samplers_start_where_the_prior_is(prior):
+    """Chains start within two units of 0 in each coordinate."""
+    low, middle, high = dist.biject_to(standardised(prior).support)(jnp.array([-2.0, 0.0, 2.0]))
+    draws = np.asarray(prior.sample(jax.random.key(3), (4000,)))
+    below = [float(np.mean(draws < value)) for value in (low, middle, high)]
+    assert 0.0 < below[0] < 0.15
+    assert below[1] == pytest.approx(0.5, abs=0.05)
+    assert 0.85 < below[2] < 1.0
 
 
 @pytest.mark.parametrize(
