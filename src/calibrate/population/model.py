@@ -139,7 +139,9 @@ class PopulationModel:
 
     def __call__(self, data: Mapping[str, Data] | None = None) -> None:
         """Run the NumPyro program; a member that ``data`` does not name has no likelihood."""
-        median = [numpyro.sample(f"{MEDIAN}[{k}]", standardised(self.median[k])) for k in self.shared]
+        median = [
+            numpyro.sample(f"{MEDIAN}[{k}]", standardised(self.median[k])) for k in self.shared
+        ]
         spread = [numpyro.sample(f"{SD}[{k}]", standardised(self.spread[k])) for k in self.shared]
         count = len(self.shared)
         factor = jnp.eye(count)

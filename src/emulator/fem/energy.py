@@ -42,9 +42,10 @@ Energy = Callable[[jax.Array, jax.Array], jax.Array]
 
 
 def require_rest(scene: ForwardProblem) -> None:
-    """Raise :class:`InputError` for a scene that relaxes, or whose mesh is the shape under load."""
-    if scene.relaxes:
-        raise InputError(f"scene '{scene.name}' has viscosity: follow it through Simulator.path")
+    """Raise :class:`InputError` for a scene in time, or whose mesh is the shape under load."""
+    if scene.in_time:
+        what = "inertia" if scene.viscosity is None else "viscosity"
+        raise InputError(f"scene '{scene.name}' has {what}: follow it through Simulator.path")
     if scene.loaded_by:
         raise InputError(
             f"scene '{scene.name}' is known under load (loaded_by), and this needs a scene at "

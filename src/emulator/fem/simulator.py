@@ -156,7 +156,7 @@ class Simulator(TableRepr):
                 f"scene '{self.scene.name}': path has shape {thetas.shape}; expected "
                 f"(m, {len(self.scene.parameters)})"
             )
-        if self.scene.relaxes:
+        if self.scene.in_time:
             through_time = import_module("emulator.fem.through_time").through_time  # a room
             return cast(Solution, through_time(self.scene, self.options, thetas))
 

@@ -65,6 +65,7 @@ class ForwardProblem(TableRepr):
     loaded_by: Mapping[str, str] = MappingProxyType({})
     table: Cells | None = None
     viscosity: Any = None
+    inertia: Any = None
 
     @property
     def usual_map(self) -> str:
@@ -82,9 +83,9 @@ class ForwardProblem(TableRepr):
         return False
 
     @property
-    def relaxes(self) -> bool:
+    def in_time(self) -> bool:
         """Say whether the law alone gives no stress: FEM follows the problem through times."""
-        return self.viscosity is not None
+        return self.viscosity is not None or self.inertia is not None
 
     @property
     @abstractmethod
@@ -174,8 +175,9 @@ class ForwardProblem(TableRepr):
         add_owners(owners, "the fibres'", self.angles)
         if self.viscosity is not None:
             add_owners(owners, "the scene's", [self.viscosity])
-            if self.timed:
-                owners["time"] = Quantity("time", "s", 0.0, low_admitted=True), "viscosity"
+        if self.timed and not (self.viscosity is None and self.inertia is None):
+            what = "inertia" if self.viscosity is None else "viscosity"
+            owners["time"] = Quantity("time", "s", 0.0, low_admitted=True), what
         return owners
 
     @property
@@ -184,16 +186,24 @@ class ForwardProblem(TableRepr):
         of_viscosity = () if self.viscosity is None else self.viscosity.quantities
         return (*self.law.parameters, *(quantity.name for quantity in of_viscosity))
 
-    def _check_viscosity(self) -> None:
-        """Keep viscosity, also of a scene file's table; refuse what time does not go with."""
-        if self.viscosity is None:
+    def _check_time(self) -> None:
+        """Keep viscosity and inertia, also of a file's tables; refuse what time does not fit."""
+        if self.viscosity is None and self.inertia is None:
             return
-        viscosity_of = import_module("emulator.viscosity.series").viscosity_of  # a room
-        object.__setattr__(self, "viscosity", viscosity_of(self.viscosity))
+        if self.viscosity is not None:
+            viscosity_of = import_module("emulator.viscosity.series").viscosity_of  # a room
+            object.__setattr__(self, "viscosity", viscosity_of(self.viscosity))
+        if self.inertia is not None:
+            inertia_of = import_module("emulator.viscosity.motion").inertia_of
+            object.__setattr__(self, "inertia", inertia_of(self.inertia))
         if not self.law.objective:
-            raise InputError(f"law '{self.law.name}' is of small strains; viscosity needs another")
+            raise InputError(
+                f"law '{self.law.name}' is of small strains; what goes through time needs another"
+            )
         if self.loaded_by:
-            raise InputError("a mesh is unloaded without time; leave out loaded_by or viscosity")
+            raise InputError(
+                "a mesh is unloaded without time; leave out loaded_by, or viscosity and inertia"
+            )
         if self.timed and "time" in self.constants:
             raise InputError("'time' is a constant, so nothing goes on; make it a parameter, in s")
 

@@ -71,6 +71,8 @@ class SceneData(ForwardProblem):
         (:mod:`emulator.fem.loaded`), and displacements are those from the mesh.
     viscosity : how the law's stress relaxes (:mod:`emulator.viscosity`), as a scene file's table;
         theta then has a ``time`` in s, through which ``Simulator.path`` goes.
+    inertia : the body's mass (:mod:`emulator.viscosity.motion`), likewise: ``{"density": 1.05}`` in
+        g/cm3.
     """
 
     name: str
@@ -90,19 +92,21 @@ class SceneData(ForwardProblem):
     loaded_by: Mapping[str, str] = field(default_factory=dict)
     stiffness_modes: np.ndarray | None = None
     viscosity: Any = None
+    inertia: Any = None
 
     def __post_init__(self) -> None:
         for name in ("constants", "origin", "loaded_by"):
             object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
         try:
-            self._check_viscosity()
+            self._check_time()
             self._check_tissue()
             prescribed = self.prescribed  # refuses supports that contradict one another
             self._check_parameters()
             self._check_dilatation()
-            if not self.supports:
-                raise InputError("no support, the body could move freely")
-            check_motions(self.mesh, self.supports)
+            if self.inertia is None:  # else it may
+                if not self.supports:
+                    raise InputError("no support, the body could move freely")
+                check_motions(self.mesh, self.supports)
             for part in (*self.loads, *self.supports):
                 for name in part.facet_sets:
                     self.mesh.facet_set(name)
@@ -110,6 +114,9 @@ class SceneData(ForwardProblem):
                     self.mesh.node_set(vars(part)["node_set"])
             for load in self.loads:
                 load.check(self.mesh, prescribed)
+            slow = next((s.kind for s in self.supports if s.resists_velocity), None)
+            if slow and self.viscosity is None and self.inertia is None:
+                raise InputError(f"{slow} resist velocities, and nothing goes on; give inertia")
             self._check_image()
         except InputError as error:
             raise InputError(f"scene '{self.name}': {error}") from error
@@ -129,7 +136,7 @@ class SceneData(ForwardProblem):
         """Entries of theta that belong to loads or move supports; the others are the body's."""
         loads = (load for load in self.loads if not load.shared)
         names = {quantity.name for load in loads for quantity in load.quantities}
-        names |= {*self.prescribed.per_unit, *(("time",) if self.viscosity else ())}
+        names |= {*self.prescribed.per_unit, *(("time",) if self.in_time else ())}
         return tuple(parameter.name for parameter in self.parameters if parameter.name in names)
 
     @override

@@ -38,7 +38,7 @@ from emulator.specimens.states import States, motion_columns, pull_columns, stat
 from emulator.specimens.tube import Tube
 from emulator.specimens.tube import motion_columns as tube_columns
 from emulator.viscosity.overstress import Histories, histories
-from emulator.viscosity.series import Viscosity
+from emulator.viscosity.series import KELVIN_VOIGT, Viscosity
 from emulator.viscosity.times import TIME, check_times, read_times
 
 _CONVENTIONS = (
@@ -117,7 +117,7 @@ class Specimen(ForwardProblem):
 
     solved_by = "emulator.specimens.homogeneous:homogeneous"
     usual_map = "incompressible"
-    relaxes = False  # its map follows the tests through their times
+    in_time = False  # its map follows the tests through their times
     timed = False
 
     @property
@@ -139,7 +139,7 @@ class Specimen(ForwardProblem):
         if self.tube is not None:
             object.__setattr__(self, "regions", self.tube.regions(count))
         try:
-            self._check_viscosity()
+            self._check_time()
             self._check_directions(count, 1)
             self._check_parameters()
             if self.grips is not None and self.homogeneous:
@@ -168,6 +168,8 @@ class Specimen(ForwardProblem):
             return
         if self.times is None:
             raise InputError(f"viscosity needs the time of each state; give '{TIME}', in s")
+        if self.viscosity.kind == KELVIN_VOIGT:
+            raise InputError(f"viscosity {KELVIN_VOIGT} is for bodies; use prony or spectrum")
         if self.grips is not None:
             raise InputError("grips are solved without time; leave out viscosity or grips")
         object.__setattr__(self, "times", frozen_array(self.times))

@@ -22,6 +22,10 @@ equal ratios of times between ``tau_1`` and ``tau_2``, with the strength c, ``sp
 Gauss-Legendre points in :math:`\ln \tau` make it a series of 16 terms, or of ``terms``. The largest
 error of G is 3e-5 of :math:`c L / (1 + c L)` where the times are five decades apart, 2e-7 for three
 decades (``tests/emulator/viscosity/test_series.py``).
+
+``kelvin_voigt`` has no term: a stress :math:`\eta \dot E` beside the law's, with ``eta`` in kPa s
+and the Green-Lagrange strain E, as in models of the beating heart (Arostica et al. 2025). For
+bodies only.
 """
 
 from __future__ import annotations
@@ -37,9 +41,10 @@ import numpy as np
 from emulator.core.errors import InputError, check_known
 from emulator.mechanics.laws.law import Quantity, number
 
-KINDS = ("prony", "spectrum")
-_MOST = {"prony": 6, "spectrum": 64}
-_USUAL = {"prony": 1, "spectrum": 16}
+KELVIN_VOIGT = "kelvin_voigt"
+KINDS = ("prony", "spectrum", KELVIN_VOIGT)
+_MOST = {"prony": 6, "spectrum": 64, KELVIN_VOIGT: 0}
+_USUAL = {"prony": 1, "spectrum": 16, KELVIN_VOIGT: 0}
 
 
 class Series(NamedTuple):
@@ -59,7 +64,8 @@ class Viscosity:
 
     Parameters
     ----------
-    kind : ``prony`` for a few terms, ``spectrum`` for Fung's continuous spectrum.
+    kind : ``prony`` for a few terms, ``spectrum`` for Fung's continuous spectrum,
+        ``kelvin_voigt`` for a stress of the strain's rate.
     terms : the number of terms; by default 1, and 16 points of a spectrum.
     """
 
@@ -70,6 +76,8 @@ class Viscosity:
         if self.kind not in KINDS:
             raise InputError(f"viscosity: kind '{self.kind}'; use {' or '.join(KINDS)}")
         most = _MOST[self.kind]
+        if self.terms is not None and self.kind == KELVIN_VOIGT:
+            raise InputError(f"viscosity: {KELVIN_VOIGT} has no terms; leave them out")
         if self.terms is not None and not 1 <= self.terms <= most:
             raise InputError(
                 f"viscosity: {self.terms} terms of kind '{self.kind}'; give 1 to {most}"
@@ -83,6 +91,8 @@ class Viscosity:
     @property
     def quantities(self) -> tuple[Quantity, ...]:
         """The parameters, in the order of the terms."""
+        if self.kind == KELVIN_VOIGT:
+            return (Quantity("eta", "kPa s", low_admitted=True),)
         if self.kind == "spectrum":
             return number("spectrum"), Quantity("tau_1", "s"), Quantity("tau_2", "s")
         pairs = (
@@ -93,6 +103,8 @@ class Viscosity:
 
     def series(self, values: Mapping[str, jax.Array]) -> Series:
         """Return fractions and times of the terms from the parameters' values by name."""
+        if not self.count:
+            return Series(jnp.zeros(0), jnp.zeros(0))
         if self.kind == "spectrum":
             logs = jnp.log(values["tau_1"]), jnp.log(values["tau_2"])
             points, weights = np.polynomial.legendre.leggauss(self.count)

@@ -208,7 +208,7 @@ def test_a_mesh_known_under_load_and_small_strains_are_refused():
     with pytest.raises(InputError, match="'time' is a constant, so nothing goes on"):
         clamped(constants={"kappa": 100.0, "time": 1.0})
     small = {"law": em.find_law("small_strain"), "constants": {"lam": 100.0}}
-    with pytest.raises(InputError, match="is of small strains; viscosity needs another"):
+    with pytest.raises(InputError, match="small strains; what goes through time needs another"):
         clamped(**small)
 
 

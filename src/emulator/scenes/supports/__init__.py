@@ -2,10 +2,10 @@
 
 from emulator.scenes.part import BoundaryCondition
 from emulator.scenes.supports.dirichlet import Support
-from emulator.scenes.supports.elastic import ElasticSupport
+from emulator.scenes.supports.elastic import Dashpots, ElasticSupport
 
 SUPPORTS: dict[str, type[BoundaryCondition]] = {
-    support.kind: support for support in (Support, ElasticSupport)
+    support.kind: support for support in (Support, ElasticSupport, Dashpots)
 }
 
-__all__ = ["SUPPORTS", "BoundaryCondition", "ElasticSupport", "Support"]
+__all__ = ["SUPPORTS", "BoundaryCondition", "Dashpots", "ElasticSupport", "Support"]
