@@ -48,7 +48,6 @@ SMALLEST_P = 0.005
 OUTLYING = 4.0  # sds, beyond which 0.6 % of sets of 100 Gaussian data have a datum
 LARGEST_MAP_ERROR = 0.5  # noise sd by which the forward map may miss FEM's data
 LARGEST_MAP_MOVE = 0.5  # posterior sd by which that may move a mean, as for a finer mesh
-LARGEST_DIVERGENT = 0.002
 MAP_FIRST = "mend the map first"  # the remedy of chains on a wrong map
 _FEWEST = 200  # replicates from which a small p, or a share of the prior's sd, can be estimated
 _LOWEST_EFFICIENCY = 0.2
@@ -91,7 +90,7 @@ def sampling_faults(s: Sampling, box: Sequence[BoxEnd] = ()) -> Iterator[Fault]:
         yield ("R-hat is not a number", "draw more")
     elif not s.r_hat <= limits.REFUSE_ABOVE_R_HAT:
         yield (f"the chains disagree, R-hat {s.r_hat:.3f}", "draw more, or find their modes")
-    if not s.divergences <= max(LARGEST_DIVERGENT * s.transitions, 1):
+    if not s.divergences <= max(limits.LARGEST_DIVERGENT * s.transitions, 1):
         yield (
             f"{s.divergences} of {s.transitions} transitions diverged",
             "the sampler cannot follow the posterior everywhere; raise target_accept"

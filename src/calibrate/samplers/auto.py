@@ -1,7 +1,8 @@
 """The sampler by default, which chooses between importance sampling and NUTS.
 
 It takes the draws of importance sampling where unknowns are few, the forward map is fast in
-batches, populations agree and the tail of the weights is light, and those of NUTS elsewhere.
+batches, populations agree and the tail of the weights is light, and those of NUTS elsewhere. Where
+too many of its transitions diverge, NUTS runs again in smaller steps, unless each solves FEM.
 """
 
 from __future__ import annotations
@@ -11,22 +12,26 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar
 
 import jax
+import numpy as np
 
 from calibrate.importance.weights import LARGEST_PARETO_SHAPE
-from calibrate.samplers.diagnostics import converged
+from calibrate.samplers.diagnostics import LARGEST_DIVERGENT, converged
 from calibrate.samplers.importance import IMPORTANCE
 from calibrate.samplers.nuts import NUTS, NUTSOptions
 from calibrate.samplers.protocol import Context, Draws, Sampler
 from calibrate.statistical_model import Data
 from calibrate.statistical_model.density import Density
+from emulator.core.checkpoint import Checkpoint
 from emulator.core.errors import SolverError
 
 MOST_UNKNOWNS = 8
 # Draws of a population from which agreement is judged: fewer would disagree, or be too few for the
 # limit of effective draws, where populations are right.
 _JUDGED = 1000
+_SMALL_STEPS = 0.97  # acceptance that a second run of NUTS adapts to
 # Attributes of a run of ``auto``: whose draws they are, and why not those of importance sampling.
 SAMPLED_BY, NOT_BY_IMPORTANCE = "sampled_by", "not_by_importance"
+TARGET_ACCEPT = "target_accept"  # of a second run of NUTS
 
 
 @dataclass(frozen=True)
@@ -55,8 +60,28 @@ class Auto(Sampler):
         if context.progress:
             print(f"sampled by {NUTS.name}: {draws}", file=sys.stderr, flush=True)
         why = {SAMPLED_BY: NUTS.name, NOT_BY_IMPORTANCE: draws}
-        draws = NUTS.sample(density, data, _for(NUTS, options), context)
+        draws = _by_nuts(density, data, _for(NUTS, options), context)
         return draws._replace(attributes={**why, **draws.attributes})
+
+
+def _by_nuts(density: Density, data: Data, options: NUTSOptions, context: Context) -> Draws:
+    """Return the draws of NUTS: of two runs, where the first diverges, those that do so less."""
+    draws = NUTS.sample(density, data, options, context)
+    small = replace(options, target_accept=max(_SMALL_STEPS, options.target_accept))
+    share = _diverging(draws)
+    if share <= LARGEST_DIVERGENT or small == options or not density.batches:
+        return draws
+    if context.progress:
+        said = f"{share:.2g} of its transitions diverge: again in smaller steps"
+        print(f"{NUTS.name}: {said}", file=sys.stderr, flush=True)
+    again = NUTS.sample(density, data, small, context._replace(checkpoint=Checkpoint()))
+    again = again._replace(attributes={TARGET_ACCEPT: small.target_accept, **again.attributes})
+    return min(again, draws, key=_diverging)
+
+
+def _diverging(draws: Draws) -> float:
+    """Return the share of transitions that diverge."""
+    return float(np.mean(draws.statistics["diverging"]))
 
 
 def _by_importance(

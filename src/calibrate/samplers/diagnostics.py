@@ -17,6 +17,7 @@ WARN_ABOVE_R_HAT = 1.01  # Vehtari et al. (2021)
 REFUSE_ABOVE_R_HAT = 1.05  # the chains are draws of different posteriors
 ENOUGH_ESS = 400.0  # Vehtari et al. (2021); a run goes on until it has them
 REFUSE_BELOW_ESS = 100.0
+LARGEST_DIVERGENT = 0.002  # share of transitions that may diverge
 
 _AXES = {"chain_axis": 0, "draw_axis": 1}
 _FEWEST_DRAWS = 8  # draws of a single chain: two in each quarter

@@ -13,9 +13,12 @@ from calibrate.importance.proposals import Kernels, effective_number, resampled,
 from calibrate.importance.weights import normalised
 from calibrate.posterior.diagnosis import diagnose
 from calibrate.samplers import Density, ImportanceOptions, density_of, find_sampler
-from calibrate.samplers.auto import AUTO, NOT_BY_IMPORTANCE, SAMPLED_BY, AutoOptions
+from calibrate.samplers.auto import AUTO, NOT_BY_IMPORTANCE, SAMPLED_BY, TARGET_ACCEPT, AutoOptions
+from calibrate.samplers.chains import ChainSampler
 from calibrate.samplers.importance import IMPORTANCE, ImportanceSampling, _Run
+from calibrate.samplers.nuts import NUTSOptions
 from calibrate.samplers.protocol import Context, Draws
+from emulator.core.checkpoint import Checkpoint
 from emulator.core.errors import InputError, SolverError
 from emulator.surrogates.fem import fem_forward
 from linear_support import bent_problem, linear_problem, share_and_evidence
@@ -207,6 +210,40 @@ def test_nuts_is_taken_where_importance_sampling_does_not_work(
     assert draws.attributes[NOT_BY_IMPORTANCE] == "the forward map solves FEM"
     assert "sampled by nuts: the forward map solves FEM" in capsys.readouterr().err
     assert len(asked) == 1
+
+
+@pytest.mark.parametrize(
+    ("shares", "batches", "runs", "target"),
+    [
+        ((0.001, 0.0), True, [0.85], None),  # few diverge
+        ((0.01, 0.0), True, [0.85, 0.97], 0.97),
+        ((0.01, 0.02), True, [0.85, 0.97], None),  # smaller steps do not help
+        ((0.01, 0.0), False, [0.85], None),  # each step solves FEM
+    ],
+)
+def test_nuts_that_diverges_runs_again_in_smaller_steps(
+    beam, monkeypatch, shares, batches, runs, target
+):
+    model, data = linear_problem(beam)
+    model, checked = model.given(data)
+    asked = []
+
+    class Diverging(ChainSampler):
+        def sample(self, density, data, options, context):
+            share = shares[len(asked)]
+            asked.append(options.target_accept)
+            assert context.checkpoint.path is None or len(asked) == 1
+            diverging = np.arange(4000).reshape(4, 1000) < 4000 * share
+            return Draws(np.zeros((4, 1000, 2)), {"diverging": diverging})
+
+    monkeypatch.setattr("calibrate.samplers.auto.IMPORTANCE", Refusing([]))
+    monkeypatch.setattr("calibrate.samplers.auto.NUTS", Diverging("nuts", NUTSOptions, None))
+    of = replace(density_of(model), batches=batches)
+    context = Context(checkpoint=Checkpoint("draws.safetensors", {}))
+    draws = AUTO.sample(of, checked, AutoOptions(), context)
+    assert asked == runs
+    assert draws.attributes.get(TARGET_ACCEPT) == target
+    assert draws.statistics["diverging"].mean() == min(shares[: len(runs)])
 
 
 def test_few_draws_are_taken_from_populations_that_agree(beam):
