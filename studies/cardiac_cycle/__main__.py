@@ -186,7 +186,7 @@ def main() -> None:
         results.case("quick", partial(cycle, 0.02, 8, 0.2, arguments.peer))
     else:
         results.case("cycle", partial(cycle, 0.008, 250, SECONDS, arguments.peer))
-    (case,) = results.cases
+    case = results.cases[-1]
     for name, share in case.get("apart, of the largest", {}).items():
         print(f"{name}: {case['apart'][name]:.3f} mm apart, {100.0 * share:.2f} % of the largest")
     print(f"seconds: {case['seconds']}; EasyFEA {case.get('easyfea seconds', 'not run')}")

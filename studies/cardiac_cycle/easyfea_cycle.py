@@ -16,12 +16,12 @@ from EasyFEA.FEM import FeArray, Operators
 from EasyFEA.Simulations import Term
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from studies.cardiac_cycle import ventricle as of  # noqa: E402
+from studies.cardiac_cycle import ventricle as of
 
 
 def pressed(group, u, elements, pressure):
-    """The pressure on the deformed surface."""
-    return Operators.NonLinear.FollowingPressure(group, u, pressure, elements, MatrixType.mass)
+    """The pressure on the deformed surface; the mesh's normals point into the cavity."""
+    return Operators.NonLinear.FollowingPressure(group, u, -pressure, elements, MatrixType.mass)
 
 
 def everywhere(group, elements, coef):
@@ -39,8 +39,11 @@ class Ventricle(Simulations.HyperElastic):
         return [
             *super().Get_terms(*arguments),
             Term("KR", pressed, dim=2, tag="endo", pressure=self.pressure),
-            *(Term(s, everywhere, dim=2, tag="top", coef=c) for s, c in zip("KC", of.TOP)),
-            *(Term(s, along, dim=2, tag="epi", coef=c) for s, c in zip("KC", of.EPI)),
+            *(
+                Term(s, everywhere, dim=2, tag="top", coef=c)
+                for s, c in zip("KC", of.TOP, strict=True)
+            ),
+            *(Term(s, along, dim=2, tag="epi", coef=c) for s, c in zip("KC", of.EPI, strict=True)),
         ]
 
 
@@ -65,7 +68,7 @@ def main() -> None:
     halves = step * (np.arange(count) + 0.5)
     ends = of.curves(np.append(halves, seconds))
     u, begin = [], perf_counter()
-    for tension, pressure in list(zip(*ends))[:count]:
+    for tension, pressure in zip(*(curve[:count] for curve in ends), strict=True):
         simulation.Bc_Init()
         simulation.pressure, material.active_stress = pressure, tension
         simulation.Solve()

@@ -1,4 +1,4 @@
-"""The monoventricular case of Arostica et al. (2025), in SI units: ellipsoid, fibres, curves, numbers.
+"""The monoventricular case of Arostica et al. (2025): ellipsoid, fibres, curves, numbers; SI units.
 
 It needs NumPy only (and Gmsh for the mesh), so that another program's interpreter reads it, too.
 The wall lies between the ellipsoids that :func:`radii` has at t = 0 and 1; its long axis is x, with

@@ -94,6 +94,34 @@ def specimen() -> cal.Model:
     return cal.model(forward, cal.stresses(scene, "cauchy_x,cauchy_y"), cal.GaussianNoise(sd=2.0))
 
 
+def relaxing() -> cal.Model:
+    """A tissue that relaxes, pulled at two rates, held and let go, incompressible."""
+    held = np.array([1.3, 2.0, 4.0, 8.0, 15.0, 30.0])
+    columns, stretches = [], []
+    for rate in (1.0, 0.1):
+        pulled, end = np.linspace(0.2, 1.0, 5) / rate, held + 1.0 / rate
+        columns.append(np.concatenate([pulled, end, end[-1:] + np.array([0.5, 1.0]) / rate]))
+        stretches.append(1.0 + 0.15 * np.array([*np.linspace(0.2, 1.0, 5), *np.ones(6), 0.5, 0.0]))
+    scene = em.specimen(
+        {
+            "protocol": ["fast"] * 13 + ["slow"] * 13,
+            "time": np.concatenate(columns),
+            "stretch_x": np.concatenate(stretches),
+        },
+        viscosity={"kind": "prony", "terms": 1},
+        law=em.find_law("yeoh"),
+        parameters=(
+            em.Parameter("c_1", "kPa", 1.0, 20.0),
+            em.Parameter("c_2", "kPa", 1.0, 40.0),
+            em.Parameter("relaxation_1", "", 0.1, 0.9),
+            em.Parameter("tau_1", "s", 0.3, 30.0, "log"),
+        ),
+        constants={"c_3": 1.0, "kappa": 1e4},
+    )
+    forward = em.homogeneous(scene, incompressible=True)
+    return cal.model(forward, cal.stresses(scene, "stress_x"), cal.GaussianNoise(sd=0.2))
+
+
 @dataclass(frozen=True)
 class Case:
     """A model, who makes its data, and whether the check should pass."""
@@ -108,6 +136,7 @@ CASES = {
     "beam": Case("beam", beam, cal.by_fem, passes=True),
     "ventricle": Case("left ventricle", ventricle, cal.by_fem, passes=True),
     "specimen": Case("biaxial specimen", specimen, lambda model: model, passes=True),
+    "relaxing": Case("specimen that relaxes", relaxing, lambda model: model, passes=True),
     "noise": Case("beam, 1.5 times the model's noise", beam, noisier, passes=False),
     "prior": Case("beam, lam from the upper half of its range", beam, stiffer, passes=False),
     "map": Case("beam, 2 % more displacement", beam, biased, passes=False),

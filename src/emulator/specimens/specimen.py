@@ -240,20 +240,23 @@ def specimen(
 
     Parameters
     ----------
-    given : its states, or the columns (m,) of one test, as
-        :func:`~emulator.specimens.states.states` takes them, and ``time`` in s with viscosity.
+    given : its states, or the columns (m,) of its tests, as
+        :func:`~emulator.specimens.states.states` takes them, with ``protocol``, the test of each
+        state, where there are several, and with viscosity ``time`` in s.
     ordered : see there.
     tube : the sector of a tube whose motion ``given`` is, see :mod:`emulator.specimens.tube`.
     entries : the other fields of a :class:`Specimen`.
     """
-    motion = given
-    if isinstance(given, Mapping) and TIME in given:
-        entries = {"times": np.asarray(given[TIME], float), **entries}
-        motion = {word: values for word, values in given.items() if word != TIME}
-    if not isinstance(motion, States):
-        timed = entries.get("viscosity") is not None
-        motion = states_in(motion, tube=tube, ordered=ordered, timed=timed)
-    return Specimen(states=motion, tube=tube, **{"name": "specimen", **entries})
+    if isinstance(given, States):
+        return Specimen(states=given, tube=tube, **{"name": "specimen", **entries})
+    columns = dict(given)
+    tests, times = columns.pop(PROTOCOL, None), columns.pop(TIME, None)
+    if times is not None:
+        entries = {"times": np.asarray(times, float), **entries}
+    timed = entries.get("viscosity") is not None
+    names = None if tests is None else list(map(str, tests))
+    states = states_in(columns, names, tube=tube, ordered=ordered, timed=timed)
+    return Specimen(states=states, tube=tube, **{"name": "specimen", **entries})
 
 
 def require_specimen(problem: ForwardProblem) -> Specimen:

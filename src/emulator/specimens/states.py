@@ -146,6 +146,8 @@ def states(
     held = np.array([~np.isnan(columns[w]) for w in sheared]).any(axis=0) | np.zeros(count, bool)
     gradients = np.where(free[:, :, None] & diagonal, 0.0, H)
     _check(gradients, free, pulled, held)
+    if protocols is not None and len(protocols) != count:
+        raise InputError(f"{len(protocols)} names of tests for {count} states; give each its test")
     tests = rows_of([""] * count if protocols is None else protocols)
     for name, rows in tests.items() if ordered else ():
         _check_control(free[rows], pulls[rows], rows, name)
@@ -168,7 +170,11 @@ def components_of(columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.nda
     for word, values in columns.items():
         name, unit = with_unit(word)
         match = _MOTION.fullmatch(name)
-        assert match is not None
+        if match is None:
+            raise InputError(
+                f"column '{word}' says no motion; motions are stretch_x, strain_x, green_x, "
+                f"shear_xy and {APPLIED}_x"
+            )
         measure, axis, *plane = match.groups()
         numbers = np.asarray(values, dtype=float)
         if numbers.shape != (count,):
