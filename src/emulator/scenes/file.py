@@ -111,7 +111,7 @@ def _on_mesh(
     """Return the fields of a scene that its body, its loads and its supports give."""
     if not file.supports:
         raise source.error("key 'supports' is missing; expected tables [[supports]]")
-    for table in ("grips", "tube", "viscosity"):
+    for table in ("grips", "tube"):
         if table in source.data:
             problem = f"only a specimen has {table}; give its table as 'specimen'"
             raise source.error(problem, (table,))
@@ -137,7 +137,19 @@ def _on_mesh(
         "supports": file.supports,
         "dilatation": file.dilatation,
         "loaded_by": file.loaded_by,
+        "viscosity": _viscosity(file, source),
+        "inertia": None if file.inertia is None else file.inertia.model_dump(),
     }
+
+
+def _viscosity(file: SceneFile, source: Source) -> Any:
+    """Return the viscosity of a body, or None."""
+    with source.at("viscosity", table=("viscosity",)):
+        if file.viscosity is None:
+            return None
+        for viscosity_of in offered("emulator.viscosity.series", "viscosity_of"):
+            return viscosity_of(file.viscosity.model_dump())
+        raise InputError("this needs the room 'emulator.viscosity'")
 
 
 def _one_body(folder: Path, file: SceneFile, law: Law, source: Source) -> tuple[Body, Regions]:

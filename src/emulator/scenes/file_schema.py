@@ -97,13 +97,23 @@ class TubeTable(Table):
 
 
 class ViscosityTable(Table):
-    """How the stress of a specimen's law relaxes: docs/viscosity.md."""
+    """How the stress of a law relaxes: docs/viscosity.md."""
 
-    kind: Literal["prony", "spectrum"] = "prony"
+    kind: Literal["prony", "spectrum", "kelvin_voigt"] = "prony"
     """prony: relaxation_1 and tau_1 (s), and so on for each term; spectrum: Fung's continuous one,
-    with spectrum, tau_1 and tau_2 (s)."""
+    with spectrum, tau_1 and tau_2 (s); kelvin_voigt: of a body, eta (kPa s) times the strain's
+    rate."""
     terms: int | None = None
     """number of terms, 1 by default; of points of a spectrum, 16 by default."""
+
+
+class InertiaTable(Table):
+    """The mass of a body that goes through time: docs/viscosity.md."""
+
+    density: float = 1.05
+    """mass density in g/cm3."""
+    spectral_radius: float = 0.8
+    """share of the fastest vibrations that a time step leaves, 0 to 1."""
 
 
 class SceneFile(Table):
@@ -124,7 +134,10 @@ class SceneFile(Table):
     tube: TubeTable | None = None
     """of a specimen that is a tube, whose table has radii and stretch_axial."""
     viscosity: ViscosityTable | None = None
-    """of a specimen whose table has a column time (s); without it, the specimen is elastic."""
+    """of a specimen whose table has a column time (s), or of a body, which then has a parameter
+    time; without it, both are elastic."""
+    inertia: InertiaTable | None = None
+    """of a body that goes through time; without it, it has no mass."""
     parameters: dict[str, ParameterTable]
     """what varies: parameters of the law, of loads and of the stiffness."""
     supports: tuple[Annotated[BoundaryCondition, OneOf("kind", SUPPORTS, "held")], ...] = ()

@@ -5,6 +5,7 @@ import pytest
 
 import calibrate as cal
 import emulator as em
+from calibrate.cli import main
 from calibrate.measurements.data import read_measurements, write_data
 from calibrate.project.experiment import read_experiment
 from calibrate.project.specimen import draft_specimen
@@ -147,11 +148,58 @@ def test_a_data_file_has_the_times_of_its_specimen(tmp_path):
         read_measurements(scene, tmp_path / "late.csv")
 
 
-def test_a_mesh_has_no_viscosity(tmp_path):
-    text = SCENE.replace('specimen = "t.csv"\ngrips = "none"', 'mesh = "m.vtu"')
-    (tmp_path / "t.toml").write_text(text + '[[supports]]\nkind = "held"\nnode_set = "base"\n')
-    with pytest.raises(InputError, match="only a specimen has viscosity"):
-        read_scene(tmp_path / "t.toml")
+IN_TIME = """
+[inertia]
+density = 1.2
+[parameters.time]
+unit = "s"
+range = [0.0, 10.0]
+[[supports]]
+node_set = "left"
+[[supports]]
+kind = "dashpots"
+facet_set = "right"
+damping = 0.1
+"""
+
+
+def test_a_file_of_a_body_in_time_is_the_scene(tmp_path, capsys):
+    em.write_mesh(tmp_path / "m.vtu", em.generators.box((2.0, 1.0, 1.0), (2, 1, 1)))
+    text = SCENE.replace('specimen = "t.csv"\ngrips = "none"', 'mesh = "m.vtu"') + IN_TIME
+    (tmp_path / "t.toml").write_text(text)
+    scene = read_scene(tmp_path / "t.toml")
+    assert (scene.viscosity.kind, scene.viscosity.count) == ("prony", 1)
+    assert (scene.inertia.density, scene.inertia.spectral_radius) == (1.2, 0.8)
+    assert scene.supports[1].damping == 0.1
+    theta = scene.theta(mu=8.0, relaxation_1=0.5, tau_1=5.0, time=1.0)
+    assert not em.Simulator(scene).path(theta[None]).status.any()
+    values = ["mu=8", "relaxation_1=0.5", "tau_1=5", "time=1"]
+    for words in (
+        ["simulate", "--theta", *values, "--out", str(tmp_path / "out.vtu")],
+        [
+            "infer",
+            "--truth",
+            *values,
+            "--observe",
+            "nodes:3",
+            "--noise",
+            "displacement=0.1",
+            "--out",
+            str(tmp_path / "run"),
+        ],
+        ["train", "--out", str(tmp_path / "emulator")],
+    ):
+        assert main([words[0], str(tmp_path / "t.toml"), *words[1:]]) != 0
+        said = capsys.readouterr().err.strip().splitlines()[-1]
+        assert "has viscosity: follow it through Simulator.path" in said
+    for wrong, says in (
+        (text.replace("density = 1.2", "density = -1"), "density is -1"),
+        (text.replace("relaxation_1", "relaxation_2"), "relaxation_2"),
+        (text.replace("[viscosity]\n", '[viscosity]\nkind = "kelvin"\n'), "kind"),
+    ):
+        (tmp_path / "t.toml").write_text(wrong)
+        with pytest.raises(InputError, match=says):
+            read_scene(tmp_path / "t.toml")
 
 
 def test_stresses_of_two_scenes_are_those_of_their_times(tmp_path):

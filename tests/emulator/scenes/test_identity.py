@@ -8,7 +8,7 @@ import emulator as em
 from emulator.geometry.discretisation import quadrature_points
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.laws import LAWS
-from emulator.mechanics.laws.law import law_identity, probed
+from emulator.mechanics.laws.law import Quantity, law_identity, probed
 from emulator.scenes import Parameter, Support
 from emulator.scenes.identity import _LEFT_OUT, _as_set, described
 from emulator.scenes.loads import (
@@ -22,7 +22,7 @@ from emulator.scenes.loads import (
     Traction,
 )
 from emulator.scenes.scene_data import SceneData
-from emulator.scenes.supports import SUPPORTS, ElasticSupport
+from emulator.scenes.supports import SUPPORTS, Dashpots, ElasticSupport
 from emulator.scenes.tissue import FibreAngles
 from emulator.specimens.grips import Grips, GripStresses
 from emulator.specimens.specimen import Specimen, specimen
@@ -201,6 +201,10 @@ PARTS = {
             "amount": None,
         },
     ),
+    "dashpots": (
+        Dashpots("right"),
+        {"facet_set": "left", "damping": 0.6, "direction": "normal", "parameter": "slow"},
+    ),
     "elastic": (
         ElasticSupport("right"),
         {"facet_set": "left", "stiffness": 0.6, "direction": "normal", "parameter": "clamp"},
@@ -219,11 +223,13 @@ def test_every_field_of_every_load_and_support_counts(kind):
 
     def scene(part):
         names = {q.name: q for q in getattr(part, "quantities", ())}
+        slow = {"inertia": {"density": 1.0}} if kind == "dashpots" else {}
+        names |= {"time": Quantity("time", "s")} if slow else {}
         own = tuple(Parameter(n, q.unit, 0.1, 1.0) for n, q in names.items())
         base = replace(plain, loads=(), origin={})
         parameters = tuple(p for p in base.parameters if p.name in base.law.parameters)
         beside = (ElasticSupport("left", 1.0),) if kind == "held" else base.supports
-        given = {"loads": (part,)} if kind in LOADS else {"supports": (*beside, part)}
+        given = {"loads": (part,)} if kind in LOADS else {"supports": (*beside, part), **slow}
         held = (*base.supports, *(Support(s) for s in ("top", "left") if "cavity" in kind))
         given = given if kind in SUPPORTS else {**given, "supports": held}
         if getattr(part, "fibres", False):
@@ -264,6 +270,7 @@ def piece(**changes):
             entries["constants"] = entries["constants"] | {name: 0.5}
     if entries.get("viscosity"):
         entries["constants"] = entries["constants"] | {"relaxation_1": 0.5, "tau_1": 1.0}
+    if entries.get("viscosity") or entries.get("inertia"):
         entries["parameters"] = (*entries["parameters"], Parameter("time", "s", 0.0, 1.0))
     return replace(block(), **entries)
 
@@ -308,6 +315,7 @@ FIELDS = {
     "dilatation": "patch",
     "loaded_by": {"pressure": "imaged"},
     "viscosity": {"kind": "prony"},
+    "inertia": {"density": 1.1},
 }
 FIELDS_OF_SPECIMENS = {
     "states": states({"stretch_x": np.array([1.0, 1.1]), "shear_xy": np.array([0.0, 0.2])}),
