@@ -48,37 +48,28 @@ LAW = em.laws.Law(
 
 
 def scene_of(path: Path) -> em.Scene:
-    """The scene of the mesh in ``path``, in mm, kPa and s."""
+    """The scene of the mesh in ``path``, in mm, kPa and s, by a scene file beside it."""
     mesh = em.read_mesh(path)  # takes lengths as mm
     mesh = em.Mesh(mesh.nodes / MM, mesh.elements, facet_sets=mesh.facet_sets)
     fibres, sheets = of.directions(mesh.nodes[mesh.elements].mean(axis=1) * MM)
-    dampers, springs = em.scenes.supports.Dashpots, em.scenes.supports.ElasticSupport
-    ends = (("top", of.TOP, "all"), ("epi", of.EPI, "normal"))
+    em.write_mesh(path.with_suffix(".vtu"), mesh, fibres, sheets)
+    em.laws.LAWS[LAW.name] = LAW
     constants = {n: v / KPA if n.startswith("a") else v for n, v in of.LAW.items()}
-    return em.Scene(
-        name="cycle",
-        mesh=mesh,
-        law=LAW,
-        parameters=(
-            em.Parameter("pressure", "kPa", 0.0, 100.0),
-            em.Parameter("tension", "kPa", 0.0, 1000.0),
-            em.Parameter("time", "s", 0.0, 10.0),
-        ),
-        constants={**constants, "kappa": of.BULK / KPA, "eta": of.ETA / KPA},
-        loads=(
-            em.loads.FollowerPressure("endo", parameter="pressure"),
-            em.loads.ActiveTension(),
-        ),
-        supports=tuple(
-            support(name, number * MM / KPA, direction)
-            for name, numbers, direction in ends
-            for support, number in zip((springs, dampers), numbers, strict=True)
-        ),
-        fibres=fibres,
-        sheets=sheets,
-        viscosity={"kind": "kelvin_voigt"},
-        inertia={"density": of.DENSITY / 1000.0, "spectral_radius": 0.8},
-    )
+    constants |= {"kappa": of.BULK / KPA, "eta": of.ETA / KPA}
+    lines = [f'law = "{LAW.name}"', f'mesh = "{path.stem}.vtu"', "[constants]"]
+    lines += [f"{name} = {value}" for name, value in constants.items()]
+    lines += ["[viscosity]", 'kind = "kelvin_voigt"', "[inertia]", f"density = {of.DENSITY / 1e3}"]
+    for name, unit in (("pressure", "kPa"), ("tension", "kPa"), ("time", "s")):
+        lines += [f"[parameters.{name}]", f'unit = "{unit}"', "range = [0.0, 1000.0]"]
+    lines += ["[[loads]]", 'kind = "follower_pressure"', 'facet_set = "endo"']
+    lines += ["[[loads]]", 'kind = "active_tension"']
+    for surface, numbers, direction in (("top", of.TOP, "all"), ("epi", of.EPI, "normal")):
+        kinds = (("elastic", "stiffness"), ("dashpots", "damping"))
+        for (kind, name), number in zip(kinds, numbers, strict=True):
+            lines += ["[[supports]]", f'kind = "{kind}"', f'facet_set = "{surface}"']
+            lines += [f"{name} = {number * MM / KPA}", f'direction = "{direction}"']
+    path.with_suffix(".toml").write_text("\n".join(lines))
+    return em.find_scene(str(path.with_suffix(".toml")))
 
 
 def at_points(mesh: em.Mesh, u: np.ndarray) -> dict[str, np.ndarray]:

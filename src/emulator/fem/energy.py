@@ -43,9 +43,8 @@ Energy = Callable[[jax.Array, jax.Array], jax.Array]
 
 def require_rest(scene: ForwardProblem) -> None:
     """Raise :class:`InputError` for a scene in time, or whose mesh is the shape under load."""
-    if scene.in_time:
-        what = "inertia" if scene.viscosity is None else "viscosity"
-        raise InputError(f"scene '{scene.name}' has {what}: follow it through Simulator.path")
+    if scene.in_time and not scene.is_step:
+        raise InputError(f"scene '{scene.name}' goes through time: follow it by Simulator.path")
     if scene.loaded_by:
         raise InputError(
             f"scene '{scene.name}' is known under load (loaded_by), and this needs a scene at "

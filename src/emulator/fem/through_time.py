@@ -32,6 +32,8 @@ from typing import Any, NamedTuple, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
+from skfem.quadrature import get_quadrature
+from skfem.refdom import RefTet
 
 from emulator.core.errors import InputError
 from emulator.core.kept import kept
@@ -42,12 +44,13 @@ from emulator.fem.derivatives import SolutionMap, differentiable
 from emulator.fem.energy import at_points, law_gradients, parameters_at
 from emulator.fem.newton import NewtonOptions
 from emulator.fem.solution import Solution, Status
-from emulator.geometry.discretisation import Discretisation
+from emulator.geometry.discretisation import Discretisation, shapes_at
 from emulator.geometry.mesh import Mesh
 from emulator.mechanics.kinematics import Strain
 from emulator.mechanics.laws.law import Law
 from emulator.scenes.part import BoundaryCondition, LocalTerm, Values
 from emulator.scenes.scene import Scene
+from emulator.scenes.supports import Dashpots
 from emulator.scenes.tissue import Tissue
 from emulator.viscosity.motion import (
     Anchor,
@@ -111,15 +114,15 @@ class Anchored(BoundaryCondition):
     """
 
     density: float | None
-    dashpots: tuple[BoundaryCondition, ...]
+    dashpots: tuple[Dashpots, ...]
 
     def terms(self, grid: Discretisation) -> tuple[LocalTerm, ...]:
         """Return the potentials of the springs."""
         masses = []
         if self.density is not None:
-            data = self.density * grid.masses(), grid.connectivity
+            data = self.density * masses_of(grid), grid.connectivity
             masses = [LocalTerm(grid.connectivity, data, _of_mass, convex=True)]
-        rates = (term for support in self.dashpots for term in support.rate_terms(grid))
+        rates = (support.quadratic(grid) for support in self.dashpots)
         dampers = [
             LocalTerm(t.nodes, (t.data, t.nodes), partial(_of_rate, t), convex=True) for t in rates
         ]
@@ -128,6 +131,15 @@ class Anchored(BoundaryCondition):
     def resisted(self, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:  # noqa: ARG002
         """Return nothing: a step resists, the body at rest does not."""
         return np.zeros((0, 3)), np.zeros((0, 3))
+
+
+def masses_of(grid: Discretisation) -> np.ndarray:
+    """Return the integrals (m, a, a) in mm3 of the products of the shape functions."""
+    order = grid.mesh.order
+    points, weights = get_quadrature(RefTet, 2 * order)
+    values, slopes = shapes_at(order, np.column_stack([1.0 - points.sum(axis=0), *points]))
+    jacobian = np.einsum("mai,qaj->mqij", grid.mesh.nodes[grid.connectivity], slopes)
+    return np.einsum("mq,q,qa,qb->mab", np.linalg.det(jacobian), weights, values, values)
 
 
 def _of_mass(u: jax.Array, data: tuple[jax.Array, jax.Array], values: Values) -> jax.Array:
@@ -158,7 +170,7 @@ class Known(NamedTuple):
 class StepScene(Scene):
     """A step of a body as a scene; what is known of it follows the parameters in theta."""
 
-    in_time = False
+    is_step = True
 
     @classmethod
     def of(cls, scene: Scene) -> StepScene:
@@ -167,7 +179,7 @@ class StepScene(Scene):
         if scene.viscosity is not None:
             entries["law"] = StepLaw.of(scene.law, kind=scene.viscosity.kind)
         density = None if scene.inertia is None else scene.inertia.mass_density
-        dashpots = tuple(s for s in scene.supports if s.resists_velocity)
+        dashpots = tuple(s for s in scene.supports if isinstance(s, Dashpots))
         return cls(**entries | {"supports": (*scene.supports, Anchored(density, dashpots))})
 
     @cached_property
@@ -349,7 +361,7 @@ def through_time(scene: Scene, options: NewtonOptions, thetas: jax.Array) -> Sol
 def _check(scene: Scene, times: np.ndarray) -> None:
     """Refuse times (m,) that are no way through time."""
     check_times(times, {"": np.arange(len(times))}, len(times))
-    rates = scene.inertia is not None or any(s.resists_velocity for s in scene.supports)
+    rates = scene.inertia is not None or any(isinstance(s, Dashpots) for s in scene.supports)
     rates |= scene.viscosity is not None and scene.viscosity.kind == KELVIN_VOIGT
     if rates and (still := np.flatnonzero(np.diff(times, prepend=0.0) == 0.0)).size:
         raise InputError(

@@ -58,15 +58,6 @@ class Discretisation(Blocks):
     mesh: Mesh
     values: np.ndarray
 
-    def masses(self) -> np.ndarray:
-        """The integrals (m, a, a) in mm3 of the products of the shape functions, exact ones."""
-        element, _, _ = _rule(self.mesh.order)
-        points, weights = get_quadrature(element.refdom, 2 * self.mesh.order)
-        values, slopes = _tabulate(element, points)
-        jacobian = np.einsum("mai,qaj->mqij", self.mesh.nodes[self.mesh.elements], slopes)
-        volumes = np.linalg.det(jacobian) * weights
-        return np.einsum("mq,qa,qb->mab", volumes, values, values)
-
     def laplacian(self) -> csc_matrix:
         """The integrals (n, n) in mm of the products of the shape functions' gradients."""
         nodes, count = self.connectivity, len(self.mesh.nodes)

@@ -27,7 +27,8 @@ from emulator.mechanics.laws import Law
 from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.fibre_rules import FibreRule
 from emulator.scenes.parameter_space import Parameter, ParameterSpace
-from emulator.scenes.part import Load
+from emulator.scenes.part import BoundaryCondition, Load
+from emulator.scenes.supports import Dashpots
 from emulator.scenes.tissue import (
     FibreAngles,
     Tissue,
@@ -45,12 +46,14 @@ class ForwardProblem(TableRepr):
 
     solved_by : the module and the name of the class or function that makes its solver.
     outside : whether a program of somebody else's solves it.
-    timed : whether times are a load's, in theta, where it has viscosity.
+    timed : whether times are a load's, in theta, where something resists motion.
+    is_step : whether it is a step of a problem in time, whose past is known.
     """
 
     solved_by: ClassVar[str] = "emulator.fem.simulator:Simulator"
     outside: ClassVar[bool] = False
     timed: ClassVar[bool] = True
+    is_step: ClassVar[bool] = False
 
     name: str
     law: Law
@@ -66,6 +69,7 @@ class ForwardProblem(TableRepr):
     table: Cells | None = None
     viscosity: Any = None
     inertia: Any = None
+    supports: tuple[BoundaryCondition, ...] = ()
 
     @property
     def usual_map(self) -> str:
@@ -84,8 +88,9 @@ class ForwardProblem(TableRepr):
 
     @property
     def in_time(self) -> bool:
-        """Say whether the law alone gives no stress: FEM follows the problem through times."""
-        return self.viscosity is not None or self.inertia is not None
+        """Say whether the past counts: FEM follows the problem through the times in theta."""
+        slow = any(isinstance(support, Dashpots) for support in self.supports)
+        return slow or self.viscosity is not None or self.inertia is not None
 
     @property
     @abstractmethod
@@ -175,9 +180,8 @@ class ForwardProblem(TableRepr):
         add_owners(owners, "the fibres'", self.angles)
         if self.viscosity is not None:
             add_owners(owners, "the scene's", [self.viscosity])
-        if self.timed and not (self.viscosity is None and self.inertia is None):
-            what = "inertia" if self.viscosity is None else "viscosity"
-            owners["time"] = Quantity("time", "s", 0.0, low_admitted=True), what
+        if self.timed and self.in_time:
+            owners["time"] = Quantity("time", "s", 0.0, low_admitted=True), "a body in time"
         return owners
 
     @property
@@ -188,7 +192,7 @@ class ForwardProblem(TableRepr):
 
     def _check_time(self) -> None:
         """Keep viscosity and inertia, also of a file's tables; refuse what time does not fit."""
-        if self.viscosity is None and self.inertia is None:
+        if not (self.in_time or self.viscosity is not None):
             return
         if self.viscosity is not None:
             viscosity_of = import_module("emulator.viscosity.series").viscosity_of  # a room

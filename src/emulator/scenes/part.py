@@ -291,12 +291,7 @@ class Prescribed(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BoundaryCondition(Part):
-    """A part that prescribes displacements, or resists them with springs.
-
-    resists_velocity : whether it has :meth:`rate_terms`, so that the scene must go through time.
-    """
-
-    resists_velocity: ClassVar[bool] = False
+    """A part that prescribes displacements, or resists them with springs."""
 
     def held(self, mesh: Mesh) -> Held | None:
         """Return prescribed displacements, or None."""
@@ -304,10 +299,6 @@ class BoundaryCondition(Part):
 
     def terms(self, grid: Discretisation) -> tuple[LocalTerm, ...]:
         """Return the potentials of the springs."""
-        return ()
-
-    def rate_terms(self, grid: Discretisation) -> tuple[LocalTerm, ...]:
-        """Return functions of the velocity in mm/s, whose derivatives are forces that resist it."""
         return ()
 
     def on_loaded(self, grid: Discretisation) -> tuple[LocalForce, ...]:

@@ -71,8 +71,7 @@ class SceneData(ForwardProblem):
         (:mod:`emulator.fem.loaded`), and displacements are those from the mesh.
     viscosity : how the law's stress relaxes (:mod:`emulator.viscosity`), as a scene file's table;
         theta then has a ``time`` in s, through which ``Simulator.path`` goes.
-    inertia : the body's mass (:mod:`emulator.viscosity.motion`), likewise: ``{"density": 1.05}`` in
-        g/cm3.
+    inertia : the body's mass (:mod:`emulator.viscosity.motion`), likewise.
     """
 
     name: str
@@ -103,9 +102,7 @@ class SceneData(ForwardProblem):
             prescribed = self.prescribed  # refuses supports that contradict one another
             self._check_parameters()
             self._check_dilatation()
-            if self.inertia is None:  # else it may
-                if not self.supports:
-                    raise InputError("no support, the body could move freely")
+            if self.inertia is None:  # else it may move freely
                 check_motions(self.mesh, self.supports)
             for part in (*self.loads, *self.supports):
                 for name in part.facet_sets:
@@ -114,9 +111,6 @@ class SceneData(ForwardProblem):
                     self.mesh.node_set(vars(part)["node_set"])
             for load in self.loads:
                 load.check(self.mesh, prescribed)
-            slow = next((s.kind for s in self.supports if s.resists_velocity), None)
-            if slow and self.viscosity is None and self.inertia is None:
-                raise InputError(f"{slow} resist velocities, and nothing goes on; give inertia")
             self._check_image()
         except InputError as error:
             raise InputError(f"scene '{self.name}': {error}") from error
@@ -134,8 +128,7 @@ class SceneData(ForwardProblem):
     @property
     def load_parameters(self) -> tuple[str, ...]:
         """Entries of theta that belong to loads or move supports; the others are the body's."""
-        loads = (load for load in self.loads if not load.shared)
-        names = {quantity.name for load in loads for quantity in load.quantities}
+        names = {q.name for load in self.loads if not load.shared for q in load.quantities}
         names |= {*self.prescribed.per_unit, *(("time",) if self.in_time else ())}
         return tuple(parameter.name for parameter in self.parameters if parameter.name in names)
 
@@ -177,19 +170,16 @@ class SceneData(ForwardProblem):
         """Refuse an unknown ``dilatation``, or one that the elements do not have."""
         if self.dilatation not in get_args(Dilatation):
             raise InputError(
-                f"dilatation '{self.dilatation}'; use pointwise or mean, or patch on linear "
-                "tetrahedra"
+                f"dilatation '{self.dilatation}'; use pointwise, mean, or patch on linear elements"
             )
-        if self.dilatation == "mean" and self.mesh.order == 1:
-            raise InputError(
-                "mean dilatation on linear tetrahedra changes nothing, they have one point each; "
-                "make the mesh quadratic, or write dilatation 'patch'"
-            )
-        if self.dilatation == "patch" and self.mesh.order == 2:
-            raise InputError(
-                "patch dilatation is for linear tetrahedra; on quadratic ones write dilatation "
-                "'mean'"
-            )
+        faults = {
+            ("mean", 1): "mean dilatation on linear tetrahedra changes nothing, they have "
+            "one point each; make the mesh quadratic, or write dilatation 'patch'",
+            ("patch", 2): "patch dilatation is for linear tetrahedra; on quadratic ones write "
+            "dilatation 'mean'",
+        }
+        if fault := faults.get((self.dilatation, self.mesh.order)):
+            raise InputError(fault)
 
     def _check_image(self) -> None:
         """Refuse a load in theta without a value in the image, and one for a constant load."""

@@ -191,7 +191,7 @@ def test_a_file_of_a_body_in_time_is_the_scene(tmp_path, capsys):
     ):
         assert main([words[0], str(tmp_path / "t.toml"), *words[1:]]) != 0
         said = capsys.readouterr().err.strip().splitlines()[-1]
-        assert "has viscosity: follow it through Simulator.path" in said
+        assert "goes through time: follow it by Simulator.path" in said
     for wrong, says in (
         (text.replace("density = 1.2", "density = -1"), "density is -1"),
         (text.replace("relaxation_1", "relaxation_2"), "relaxation_2"),

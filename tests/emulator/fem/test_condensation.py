@@ -70,5 +70,5 @@ def test_mean_dilatation_on_linear_elements_is_refused():
     scene = block("P1")
     with pytest.raises(InputError, match="they have one point each; make the mesh quadratic"):
         replace(scene, dilatation="mean")
-    with pytest.raises(InputError, match="dilatation 'none'; use pointwise or mean"):
+    with pytest.raises(InputError, match="dilatation 'none'; use pointwise, mean"):
         replace(scene, dilatation="none")

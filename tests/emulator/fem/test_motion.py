@@ -13,6 +13,7 @@ from skfem.helpers import dot
 import emulator as em
 from emulator.core.errors import InputError
 from emulator.fem.energy import potential_energy
+from emulator.fem.through_time import masses_of
 from emulator.geometry.generators.box import box
 from emulator.mechanics.kinematics import Strain
 from emulator.scenes.supports import Dashpots, ElasticSupport
@@ -56,7 +57,7 @@ def test_masses_are_those_of_another_assembly(order):
     mesh = box((2.0, 1.0, 1.0), (2, 1, 1), order)
     grid = bar(order).discretisation
     M = np.zeros((len(mesh.nodes),) * 2)
-    for nodes, local in zip(grid.connectivity, grid.masses(), strict=True):
+    for nodes, local in zip(grid.connectivity, masses_of(grid), strict=True):
         M[np.ix_(nodes, nodes)] += local
     assert M.sum() == pytest.approx(2.0, rel=1e-12)  # the volume
     corners = MeshTet(mesh.nodes.T[:, : mesh.elements[:, :4].max() + 1], mesh.elements[:, :4].T)
@@ -74,7 +75,7 @@ def vibration():
     force = jax.jit(jax.grad(lambda u, pull: energy(u, jnp.array([8.0, pull]))))
     grid, count = still.discretisation, still.node_count
     M = np.zeros((count, count))
-    for nodes, local in zip(grid.connectivity, grid.masses(), strict=True):
+    for nodes, local in zip(grid.connectivity, masses_of(grid), strict=True):
         M[np.ix_(nodes, nodes)] += 1.2e-6 * local
     free = ~still.held[:, 0]
     inverse = np.linalg.inv(M[np.ix_(free, free)])
@@ -130,8 +131,6 @@ def test_dashpots_let_a_block_drift_and_springs_stop_it():
             ElasticSupport("left", 2.0),
             Dashpots("left", 4.0, "normal"),
         ),
-        constants={"kappa": KAPPA, "eta": 0.0},
-        viscosity={"kind": "kelvin_voigt"},
         inertia=None,
     )  # the area is 1 mm2: k = 2 mN/mm, c = 4 mN s/mm, no mass
     times = np.concatenate([[1e-4], np.linspace(0.0, 6.0, 241)[1:]])
@@ -212,18 +211,18 @@ def test_derivatives_through_a_vibration_are_those_of_differences():
         (lambda: bar(inertia={"density": np.nan}), "density is nan g/cm3"),
         (lambda: bar(inertia={"mass": 1.0}), "inertia: entry 'mass'"),
         (lambda: bar(inertia={"spectral_radius": 1.5}), "give a share from 0 to 1"),
-        (lambda: bar(parameters=(MU, PULL)), "inertia needs 'time'"),
+        (lambda: bar(parameters=(MU, PULL)), "a body in time needs 'time'"),
         (lambda: bar(inertia=None, parameters=(MU, PULL), supports=()), "could move freely"),
         (
             lambda: bar(
                 inertia=None, parameters=(MU, PULL),
                 supports=(em.Support("left"), Dashpots("right", 1.0)),
             ),
-            "dashpots resist velocities, and nothing goes on",
+            "a body in time needs 'time'",
         ),
         (lambda: Dashpots("right", 0.0), "damping is 0.0 kPa s/mm; it must be above 0"),
         (lambda: bar(viscosity={"kind": "kelvin_voigt", "terms": 1}), "has no terms"),
-        (lambda: em.Simulator(bar()).solve(jnp.ones(3)), "has inertia: follow it through"),
+        (lambda: em.Simulator(bar()).solve(jnp.ones(3)), "goes through time: follow it by"),
         (
             lambda: em.Simulator(bar()).path(path([1.0, 1.0], [1.0, 1.0])),
             "row 2: time stays 1 s; with inertia or a rate it must rise",

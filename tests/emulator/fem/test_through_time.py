@@ -179,18 +179,21 @@ def test_after_a_step_that_fails_all_have_its_status():
 @pytest.mark.parametrize(
     ("call", "line"),
     [
-        (lambda s: s.solve(s.scene.centre), "has viscosity: follow it through Simulator.path"),
-        (lambda s: s.reactions(s.rest, s.scene.centre), "has viscosity: follow it"),
-        (lambda s: potential_energy(s.scene), "has viscosity: follow it"),
+        (lambda s: s.solve(s.scene.centre), "goes through time: follow it by Simulator.path"),
+        (lambda s: s.reactions(s.rest, s.scene.centre), "goes through time: follow it"),
+        (lambda s: potential_energy(s.scene), "goes through time: follow it"),
         (
             lambda s: em.fem.element_fields(s.scene, s.rest, s.scene.centre),
-            "has viscosity: follow it",
+            "goes through time: follow it",
         ),
         (lambda s: s.path(path([1.0], [1.0])[:, :3]), r"expected \(m, 5\)"),
         (lambda s: s.path(path([1.0, 1.0], [2.0, 1.0])), "time goes back"),
         (lambda s: s.path(path([1.0], [-1.0])), "give 0 or more"),
         (lambda s: s.path(path([1.0], [np.nan])), "give 0 or more"),
-        (lambda s: replace(s.scene, parameters=s.scene.parameters[:-1]), "viscosity needs 'time'"),
+        (
+            lambda s: replace(s.scene, parameters=s.scene.parameters[:-1]),
+            "a body in time needs 'time'",
+        ),
         (lambda s: replace(s.scene, viscosity={"terms": 9}), "9 terms"),
         (lambda s: replace(s.scene, viscosity={"kinds": "prony"}), "'kinds' is unknown"),
         (lambda s: replace(s.scene, viscosity={"terms": 2}), "needs 'relaxation_2'"),

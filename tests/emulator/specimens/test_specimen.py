@@ -48,6 +48,15 @@ def test_columns_have_units(word, expected):
     assert with_unit(word) == expected
 
 
+def test_a_column_names_the_test_of_each_state():
+    columns = {"stretch_x": np.array([1.0, 1.1, 1.0, 1.2])}
+    scene = of_law({**columns, "protocol": ["a", "a", "b", "b"]})
+    assert list(scene.states.protocols) == ["a", "b"]
+    assert scene.fingerprint == of_law(states(columns, ["a", "a", "b", "b"])).fingerprint
+    with pytest.raises(InputError, match="3 names of tests for 4 states"):
+        of_law({**columns, "protocol": ["a", "a", "b"]})
+
+
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
@@ -62,6 +71,10 @@ def test_columns_have_units(word, expected):
         ({"stretch_x [mm]": [1.0, 1.1]}, "unit 'mm'"),
         ({"stretch_x [%]": [1.0, 1.1]}, "unit '%'"),
         ({"green_x": [-0.7]}, "goes down to -0.7"),
+        (
+            {"stretch_x": [1.0], "load": [1.0]},
+            "column 'load' says no motion; motions are stretch_x",
+        ),
         ({"stretch_x": [1.0, NAN]}, "row 2 has no stretch and no shear"),
         (
             {"stretch_x": [1.0, 1.1, 1.2], "stretch_y": [1.0, 1.1, NAN]},

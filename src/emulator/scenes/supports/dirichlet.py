@@ -131,6 +131,8 @@ def loose_parts(
 
 def check_motions(mesh: Mesh, supports: Sequence[BoundaryCondition]) -> None:
     """Refuse supports that let a connected part of the body move or turn."""
+    if not supports:
+        raise InputError("no support, the body could move freely")
     for nodes, free in loose_parts(mesh, supports):
         who = "its supports leave"
         if len(nodes) < len(mesh.nodes):

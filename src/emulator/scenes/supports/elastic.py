@@ -146,16 +146,11 @@ class Dashpots(OnSurface):
     kind: ClassVar[str] = "dashpots"
     magnitude: ClassVar[Quantity] = Quantity("damping", "kPa s/mm")
     noun: ClassVar[str] = "dashpots"
-    resists_velocity: ClassVar[bool] = True
 
     facet_set: str
     damping: float | None = None
     direction: Literal["all", "normal"] = "all"
     parameter: str = "damping"
-
-    @override
-    def rate_terms(self, grid: Discretisation) -> tuple[LocalTerm, ...]:
-        return (self.quadratic(grid),)
 
     @override
     def resisted(self, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
