@@ -80,7 +80,7 @@ def html_of(
     data: list[Markup] = [parts.chart(figure) for _, figure in charts.against_data(posterior)]
     labels = charts.names_with_units(posterior)
     in_chains = {name: np.asarray(posterior.tree["posterior"][name]) for name in labels}
-    draws = [charts.traces(labels, in_chains, posterior.model.sampled_priors)]
+    draws = [charts.traces(labels, in_chains, _priors(posterior))]
     draws += [charts.pairs(labels, posterior.draws())] if len(labels) > 1 else []
     body: list[tuple[str, list[Markup]]] = []
     if isinstance(scene, Scene):
@@ -135,11 +135,16 @@ def _basis(certificate: dict[str, Any]) -> Iterator[str]:
     )
 
 
+def _priors(posterior: Posterior) -> dict[str, dist.Distribution]:
+    """Return the prior of all that is inferred, in nobody's coordinates."""
+    return {**posterior.model.prior, **posterior.model.noise_priors}
+
+
 def _parameters(
     run: Run, posterior: Posterior, certificate: dict[str, Any] | None, labels: Mapping[str, str]
 ) -> list[Markup]:
     truth = run.truth if run.data == "synthetic" else {}
-    priors = posterior.model.sampled_priors
+    priors = _priors(posterior)
     shifts_by_judge = shifts(certificate or {})
     head = ["", *parts.SUMMARY, "prior", *(["truth"] if truth else [])]
     head += [_SHIFTS[judge] for judge in shifts_by_judge]

@@ -28,6 +28,7 @@ from emulator.surrogates.protocol import ForwardMap
 
 NEGLIGIBLE = 1e-3
 _ROUND_OFF = 1e-9  # mass that is round-off of a cumulative distribution function
+_CENTRED = 1.0  # median of a coordinate on the real line, of which a uniform one is 4 wide
 _DRAWS = 512  # draws from which the centre and the width of a prior are estimated
 
 
@@ -104,8 +105,13 @@ def _answers(forward: ForwardMap, k: int, value: float) -> bool:
 
 
 def standardised(prior: dist.Distribution) -> dist.Distribution:
-    """Return ``prior`` itself where it is uniform on an interval, else :class:`Standardised`."""
-    return prior if isinstance(prior, dist.Uniform) else Standardised(prior)
+    """Return ``prior`` itself where it is of an interval about whose middle it lies.
+
+    Else :class:`Standardised`.
+    """
+    around = Standardised(prior)
+    bounded = bool(np.isfinite(bounds(prior)).all())
+    return prior if bounded and abs(around.centre) < _CENTRED else around
 
 
 class Standardised(dist.Distribution):
@@ -118,15 +124,15 @@ class Standardised(dist.Distribution):
 
     arg_constraints: dict = {}  # noqa: RUF012
     pytree_data_fields = ("prior", "_support")
+    pytree_aux_fields = ("centre",)
 
     def __init__(self, prior: dist.Distribution) -> None:
         self.prior = prior
         with jax.ensure_compile_time_eval():
             draws = prior.sample(jax.random.key(0), (_DRAWS,))
             unconstrained = np.asarray(biject_to(prior.support).inv(draws))
-        self._support = _StandardisedSupport(
-            prior.support, float(np.median(unconstrained)), float(unconstrained.std())
-        )
+        self.centre = float(np.median(unconstrained))
+        self._support = _StandardisedSupport(prior.support, self.centre, float(unconstrained.std()))
         super().__init__(batch_shape=(), event_shape=())
 
     def log_prob(self, value: ArrayLike) -> jax.Array:

@@ -212,7 +212,6 @@ def test_standardised_coordinates_change_no_density():
         cal.priors.truncated_normal(1e4, 10.0, 0.0, 1e9),
         dist.LogUniform(1e-4, 1e4),
         dist.Beta(2.0, 200.0),
-        dist.HalfNormal(1e-3),
         dist.Uniform(-3.0, 1e6),
     ],
 )
