@@ -92,7 +92,7 @@ def ours(scene: em.Scene, count: int, seconds: float) -> tuple[np.ndarray, float
     times = seconds * (np.arange(count) + 1.0) / count
     tension, pressure = (curve / KPA for curve in of.curves(times))
     thetas = jnp.stack([jnp.asarray(pressure), jnp.asarray(tension), jnp.asarray(times)], axis=1)
-    simulator, took = em.Simulator(scene), []
+    simulator, took = em.Simulator(scene), list[float]()
     for _ in range(2):
         begin = perf_counter()
         solution = simulator.path(thetas)
@@ -100,7 +100,7 @@ def ours(scene: em.Scene, count: int, seconds: float) -> tuple[np.ndarray, float
         took.append(perf_counter() - begin)
     if np.asarray(solution.status).any():
         raise em.SolverError(f"{scene.name}: {int(np.asarray(solution.status != 0).sum())} steps")
-    return u, *took
+    return u, took[0], took[1]
 
 
 def cycle(size: float, count: int, seconds: float, peer: str | None) -> Case:

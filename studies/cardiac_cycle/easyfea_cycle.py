@@ -52,7 +52,7 @@ def main() -> None:
     mesh = Mesher().Mesh_Import_mesh(str(folder / "ventricle.msh"))
     places = np.asarray(mesh.groupElem.Get_GaussCoordinates_e_pg(MatrixType.rigi))
     fibres, sheets = (FeArray(vectors) for vectors in of.directions(places))
-    numbers = {}
+    numbers: dict[str, float] = {}
     for k, end in enumerate(("", "_f", "_s", "_fs")):
         b = of.LAW["b" + end]
         numbers |= {f"C{2 * k}": 0.5 * of.LAW["a" + end] / b, f"C{2 * k + 1}": b}

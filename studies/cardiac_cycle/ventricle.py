@@ -22,7 +22,8 @@ TOP, EPI = (1e5, 5e3), (1e8, 5e3)  # springs Pa/m and dashpots Pa s/m; along the
 
 def radii(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Short and long radius at the share t of the way through the wall."""
-    return tuple(inner + (outer - inner) * t for inner, outer in (SHORT, LONG))
+    short, long = (inner + (outer - inner) * t for inner, outer in (SHORT, LONG))
+    return short, long
 
 
 def depth(x: np.ndarray) -> np.ndarray:
@@ -43,9 +44,10 @@ def directions(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     across = np.hypot(x[..., 1], x[..., 2])
     u = np.arctan2(across / short, x[..., 0] / long)
     v = np.arctan2(x[..., 2], x[..., 1])
-    down = [-long * np.sin(u), short * np.cos(u) * np.cos(v), short * np.cos(u) * np.sin(v)]
-    around = [np.zeros_like(v), -np.sin(v), np.cos(v)]
-    down, around = (_unit(np.stack(of, axis=-1)) for of in (down, around))
+    out = short * np.cos(u)
+    slopes = [-long * np.sin(u), out * np.cos(v), out * np.sin(v)]
+    turns = [np.zeros_like(v), -np.sin(v), np.cos(v)]
+    down, around = (_unit(np.stack(of, axis=-1)) for of in (slopes, turns))
     angle = np.radians(HELIX[0] + (HELIX[1] - HELIX[0]) * t)[..., None]
     fibre = np.sin(angle) * down + np.cos(angle) * around
     return fibre, _unit(np.cross(fibre, np.cross(down, around)))
@@ -96,7 +98,7 @@ def write_mesh(path: str, size: float) -> None:
         gmsh.option.setNumber("Mesh.MeshSizeMin", size)
         gmsh.option.setNumber("Mesh.MeshSizeMax", size)
         gmsh.model.mesh.generate(2)
-        groups = {name: [] for name in SURFACES}
+        groups: dict[str, list[int]] = {name: [] for name in SURFACES}
         for _, surface in gmsh.model.getEntities(2):
             nodes = np.reshape(gmsh.model.mesh.getNodes(2, surface)[1], (-1, 3))
             inner = np.median(depth(nodes)) < 0.5

@@ -31,14 +31,15 @@ what is fast; of a first step, or of one more than twice as long as the one befo
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emulator.core.errors import InputError, check_known
+from emulator.core.errors import InputError
+from emulator.viscosity.series import of_table
 
 _LONGER = 2.0  # times as long as the step before, up to which a parabola is stable
 _KG_PER_MM3 = 1e-6  # g/cm3; 1 kg is 1 mN s2/mm
@@ -79,11 +80,7 @@ class Inertia:
 
 def inertia_of(entries: Inertia | Mapping[str, Any]) -> Inertia:
     """Return the inertia of the table of a scene file; one that is made already as it is."""
-    if isinstance(entries, Inertia):
-        return entries
-    for word in entries:
-        check_known(word, [field.name for field in fields(Inertia)], "inertia: entry")
-    return Inertia(**entries)
+    return of_table(Inertia, entries, "inertia")
 
 
 class Motion(NamedTuple):

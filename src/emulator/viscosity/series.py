@@ -32,7 +32,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -123,8 +123,14 @@ class Viscosity:
 
 def viscosity_of(entries: Viscosity | Mapping[str, Any]) -> Viscosity:
     """Return the viscosity of the table of a scene file; one that is made already as it is."""
-    if isinstance(entries, Viscosity):
+    return of_table(Viscosity, entries, "viscosity")
+
+
+def of_table[T](kind: type[T], entries: T | Mapping[str, Any], noun: str) -> T:
+    """Return the dataclass ``kind`` of a table's entries; one that is made already as it is."""
+    if isinstance(entries, kind):
         return entries
-    for word in entries:
-        check_known(word, [field.name for field in fields(Viscosity)], "viscosity: entry")
-    return Viscosity(**entries)
+    table = cast(Mapping[str, Any], entries)
+    for word in table:
+        check_known(word, [field.name for field in fields(cast(Any, kind))], f"{noun}: entry")
+    return kind(**table)
