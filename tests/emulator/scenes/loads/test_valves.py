@@ -104,7 +104,7 @@ def both_ventricles():
 @pytest.mark.slow
 def test_both_ventricles_unloaded_and_loaded_again_meet_their_mesh():
     scene = both_ventricles()
-    loaded = LoadedEquilibrium(scene, em.fem.NewtonOptions(), "suitesparse")
+    loaded = LoadedEquilibrium(scene, em.fem.NewtonOptions())
     rng = np.random.default_rng(0)
     for _ in range(30):
         a, imaged = rng.uniform(0.5, 3.0), rng.uniform(0.1, 1.0)
