@@ -179,7 +179,7 @@ class StepScene(Scene):
         if scene.viscosity is not None:
             entries["law"] = StepLaw.of(scene.law, kind=scene.viscosity.kind)
         density = None if scene.inertia is None else scene.inertia.mass_density
-        dashpots = tuple(s for s in scene.supports if isinstance(s, Dashpots))
+        dashpots = tuple(cast(Dashpots, s) for s in scene.supports if s.resists_velocity)
         return cls(**entries | {"supports": (*scene.supports, Anchored(density, dashpots))})
 
     @cached_property
@@ -361,7 +361,7 @@ def through_time(scene: Scene, options: NewtonOptions, thetas: jax.Array) -> Sol
 def _check(scene: Scene, times: np.ndarray) -> None:
     """Refuse times (m,) that are no way through time."""
     check_times(times, {"": np.arange(len(times))}, len(times))
-    rates = scene.inertia is not None or any(isinstance(s, Dashpots) for s in scene.supports)
+    rates = scene.inertia is not None or any(s.resists_velocity for s in scene.supports)
     rates |= scene.viscosity is not None and scene.viscosity.kind == KELVIN_VOIGT
     if rates and (still := np.flatnonzero(np.diff(times, prepend=0.0) == 0.0)).size:
         raise InputError(

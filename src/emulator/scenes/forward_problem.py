@@ -28,7 +28,6 @@ from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.fibre_rules import FibreRule
 from emulator.scenes.parameter_space import Parameter, ParameterSpace
 from emulator.scenes.part import BoundaryCondition, Load
-from emulator.scenes.supports import Dashpots
 from emulator.scenes.tissue import (
     FibreAngles,
     Tissue,
@@ -89,8 +88,8 @@ class ForwardProblem(TableRepr):
     @property
     def in_time(self) -> bool:
         """Say whether the past counts: FEM follows the problem through the times in theta."""
-        slow = any(isinstance(support, Dashpots) for support in self.supports)
-        return slow or self.viscosity is not None or self.inertia is not None
+        rates = any(support.resists_velocity for support in self.supports)
+        return rates or self.viscosity is not None or self.inertia is not None
 
     @property
     @abstractmethod

@@ -291,7 +291,10 @@ class Prescribed(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BoundaryCondition(Part):
-    """A part that prescribes displacements, or resists them with springs."""
+    """A part that prescribes displacements, or resists them or their rates."""
+
+    resists_velocity: ClassVar[bool] = False
+    """Whether the part resists how fast the body moves, and the scene goes through time."""
 
     def held(self, mesh: Mesh) -> Held | None:
         """Return prescribed displacements, or None."""

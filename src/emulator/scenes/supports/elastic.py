@@ -146,6 +146,7 @@ class Dashpots(OnSurface):
     kind: ClassVar[str] = "dashpots"
     magnitude: ClassVar[Quantity] = Quantity("damping", "kPa s/mm")
     noun: ClassVar[str] = "dashpots"
+    resists_velocity: ClassVar[bool] = True
 
     facet_set: str
     damping: float | None = None
