@@ -28,7 +28,13 @@ ROOMS = {
         "calibrate.statistical_model.gripped_fem",
         "calibrate.project.specimen",
     ),
-    "viscosity": ("emulator.viscosity", "emulator.fem.through_time", "calibrate.project.viscosity"),
+    "viscosity": (
+        "emulator.viscosity",
+        "emulator.fem.through_time",
+        "emulator.fem.history",
+        "calibrate.measurements.in_time",
+        "calibrate.project.viscosity",
+    ),
     "fields": (
         "calibrate.measurements.frame_checks",
         "calibrate.fields",

@@ -99,8 +99,8 @@ def mesh_change(
     if time.perf_counter() >= deadline:
         return MeshChange(why="no time was left (--budget)")
     scene = simulator.scene
-    if scene.outside:
-        return MeshChange(why="its mesh is another program's, which only that one can refine")
+    if scene.components:
+        return MeshChange(why=f"it is {scene.noun}, and its mesh is not refined here")
     if not isinstance(scene, Scene):
         (is_said_even,) = offered("calibrate.statistical_model.gripped_fem", "is_said_even")
         if (even := is_said_even(scene)) is not None:

@@ -132,8 +132,8 @@ def _parse_word(scene: ForwardProblem, word: str, seed: int) -> tuple[str, Obser
     kinds = kinds_of(scene)
     if kind := kinds.get(word.partition(":")[0]):
         return parse(kind, scene, word, seed)
-    if scene.outside:
-        raise InputError(f"observe '{word}': outputs of '{scene.name}' are {', '.join(kinds)}")
+    if scene.components:
+        raise InputError(f"observe '{word}': of '{scene.name}' there are {', '.join(kinds)}")
     if nodes := nodes_called(with_mesh(scene), word):
         return DISPLACEMENT, nodes
     raise InputError(

@@ -21,7 +21,7 @@ from calibrate.state_names import in_state, split, states_of
 from emulator.core import store
 from emulator.core.cells import TEXT, Cells, read_cells
 from emulator.core.errors import InputError
-from emulator.core.units import IN_KPA, IN_ML, IN_MM, factor, with_unit
+from emulator.core.units import IN_KPA, IN_ML, IN_MM, IN_MN, factor, with_unit
 
 STATE = "state"
 """Column of a CSV file that names the load state of a row."""
@@ -101,7 +101,8 @@ class CSVTable:
 
 _UNITS = (
     (re.compile(r"volume(:.+)?"), "mL", IN_ML),
-    (re.compile(r"u?[xyz]"), "mm", IN_MM),
+    (re.compile(r"u?[xyz]|length:.+"), "mm", IN_MM),
+    (re.compile(r"reaction:.+"), "N", {unit: size / IN_MN["N"] for unit, size in IN_MN.items()}),
     (re.compile(r"known:.*pressure.*"), "kPa", IN_KPA),
 )
 """Columns that may have units in brackets besides those of specimens, and the project's unit."""

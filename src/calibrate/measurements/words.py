@@ -16,13 +16,16 @@ from emulator.scenes.forward_problem import ForwardProblem
 
 def kinds_of(scene: ForwardProblem) -> Mapping[str, type[Observation]]:
     """Return the kinds of observation of a problem by name: of another program, its outputs."""
+    (of_problem,) = offered(*scene.observed_by.split(":"))
+    kinds: Mapping[str, type[Observation]] = of_problem(scene)
+    return kinds
+
+
+def kinds_of_bodies(_: ForwardProblem) -> Mapping[str, type[Observation]]:
+    """Return the kinds of observation of a body at rest or a specimen, by name."""
     from calibrate.measurements import OBSERVATIONS  # which imports this file
 
-    if not scene.outside:
-        return OBSERVATIONS
-    (kinds_of_outputs,) = offered("calibrate.external.outputs", "kinds_of_outputs")
-    kinds: Mapping[str, type[Observation]] = kinds_of_outputs(scene)
-    return kinds
+    return OBSERVATIONS
 
 
 def names_of(part: Observation) -> tuple[str, ...]:

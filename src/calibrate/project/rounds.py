@@ -251,7 +251,7 @@ def taught_map(problem: Problem, **options: Any) -> Taught | None:
     run = problem.run
     if run.forward != ROUNDS.name:
         return None
-    scene = problem.scene if problem.scene.outside else with_mesh(problem.scene)
+    scene = problem.scene if problem.scene.components else with_mesh(problem.scene)
     blank = _map_of(scene, no_process("", np.zeros(0), 1))
     model, data = build_model(problem, blank)
     model, data = replace(model, check_scale=False).given(data)

@@ -139,6 +139,9 @@ class ExternalProblem(ForwardProblem):
     origin: Mapping[str, Any] = field(default_factory=dict)
 
     solved_by = "emulator.external.solver:ExternalSimulator"
+    observed_by = "calibrate.external.outputs:kinds_of_outputs"
+    noun = "another program's"
+    components = 1
     outside = True
 
     def __post_init__(self) -> None:

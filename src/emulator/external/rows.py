@@ -39,7 +39,7 @@ from emulator.core.gaussian_process import Regression
 from emulator.core.kept import kept
 from emulator.core.machine import one_blas_thread
 from emulator.core.minimise import minimise
-from emulator.external.maps import OutputsMap
+from emulator.external.maps import OutputsMap, scores_and_modes
 from emulator.external.problem import ExternalProblem, Output, RunAnswer
 from emulator.external.tables import RunTable, content_of, read_runs
 from emulator.scenes.forward_problem import ForwardProblem
@@ -52,8 +52,6 @@ _HELD_OUT = 5  # one of so many rows is held out
 _NORMAL_90 = 1.6449  # sds that a Gaussian has 90 % within
 _LOG_LENGTH, _LOG_LENGTH_SD = 1.5, 1.0  # prior of a log length, less half the log of the inputs
 _JITTER = 1e-8
-_MOST_OUTPUTS = 30  # of which each has a process; more are a field, by its modes
-_MOST_MODES, _LEFT = 30, 1e-6  # of a field: their number, and the share of variance beyond them
 
 
 @dataclass(frozen=True)
@@ -289,22 +287,6 @@ def process_of(
     weights = np.stack([f.weights for f in fits])
     rest = missed.std(axis=0)
     return Process(x, centre, width, mean, sd, modes, rest, logs, weights, variance, left_out)
-
-
-def scores_and_modes(outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    r"""Return scores (c, m) and modes (m, n) of standardised outputs (c, n).
-
-    Each output is a mode if they are few. A field :math:`Y = U \Sigma V^T` has its principal
-    components, down to a share of 1e-6 of the variance, with scores of unit mean square:
-
-    .. math:: Y \approx S M, \quad S = \sqrt c\, U, \quad M = \Sigma V^T / \sqrt c .
-    """
-    if outputs.shape[1] <= _MOST_OUTPUTS:
-        return outputs, np.eye(outputs.shape[1])
-    vectors, sizes, modes = np.linalg.svd(outputs, full_matrices=False)
-    left, root = 1.0 - np.cumsum(sizes**2) / np.sum(sizes**2), np.sqrt(len(outputs))
-    count = min(int(np.searchsorted(-left, -_LEFT)) + 1, _MOST_MODES)
-    return root * vectors[:, :count], sizes[:count, None] * modes[:count] / root
 
 
 def _every(x: np.ndarray, y: np.ndarray, most: int, progress: Callable[[], Any]) -> np.ndarray:

@@ -98,6 +98,7 @@ class SupportForce:
     scene : the scene that has the support.
     name : the name of the support's node set or facet set.
     direction : the direction (3,), which is normalised.
+    springs : whether springs at displacements that are free count.
 
     Raises
     ------
@@ -109,6 +110,7 @@ class SupportForce:
     scene: Scene
     name: str
     direction: tuple[float, float, float]
+    springs: bool = True
 
     def __post_init__(self) -> None:
         direction = np.asarray(self.direction, dtype=float)
@@ -125,11 +127,16 @@ class SupportForce:
                 f"scene '{self.scene.name}' has no support on '{self.name}'; "
                 f"it has {', '.join(supports)}"
             )
-        prescribed, sprung = self._virtual
-        if not prescribed.any() and not sprung.any():
+        if not any(self.acts_by):
             raise InputError(
                 f"force of support '{self.name}': nothing is held along {self.direction} there"
             )
+
+    @property
+    def acts_by(self) -> tuple[bool, bool]:
+        """Whether the support acts by prescribed displacements, and by springs."""
+        prescribed, sprung = self._virtual
+        return bool(prescribed.any()), bool(sprung.any())
 
     @property
     def support_nodes(self) -> np.ndarray:
@@ -146,7 +153,7 @@ class SupportForce:
         held, virtual = self.scene.held, np.zeros(self.scene.held.shape)
         virtual[self.support_nodes] = self.direction
         sprung = np.zeros((len(virtual), 1), dtype=bool)
-        for spring in spring_terms(self.scene):
+        for spring in spring_terms(self.scene) if self.springs else ():
             sprung[spring.nodes] = True
         return np.where(held, virtual, 0.0), np.where(sprung & ~held, virtual, 0.0)
 

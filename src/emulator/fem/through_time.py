@@ -24,7 +24,7 @@ shared. Errors are of second order in the length of a step, and none of one in w
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property, partial
 from typing import Any, NamedTuple, cast
@@ -43,6 +43,7 @@ from emulator.fem.compiled import compiled, is_traced, scan
 from emulator.fem.derivatives import SolutionMap, differentiable
 from emulator.fem.energy import at_points, law_gradients, parameters_at
 from emulator.fem.newton import NewtonOptions
+from emulator.fem.reactions import SupportForce
 from emulator.fem.solution import Solution, Status
 from emulator.geometry.discretisation import Discretisation, shapes_at
 from emulator.geometry.mesh import Mesh
@@ -72,6 +73,8 @@ from emulator.viscosity.overstress import (
 from emulator.viscosity.series import KELVIN_VOIGT
 from emulator.viscosity.times import TIME, check_times
 
+ForceThroughTime = Callable[[jax.Array, jax.Array], jax.Array]
+"""The forces (m,) in mN of displacements (m, n, 3) mm and thetas (m, p), from rest on."""
 _ROWS = 4  # of a point's tissue: the stress A, and (s, d, 0)
 _MASS, _DASHPOTS = "mass of the step", "dashpots of the step"  # names of anchors among the values
 
@@ -224,7 +227,7 @@ class StepScene(Scene):
 
 
 @kept
-def _steps_of(scene: Scene, options: NewtonOptions) -> tuple[System, SolutionMap]:
+def steps_of(scene: Scene, options: NewtonOptions) -> tuple[System, SolutionMap]:
     """Return the equations of a step of ``scene``, and what solves them, compiled once."""
     system = System(StepScene.of(scene))
     return system, differentiable(system, options)
@@ -333,7 +336,7 @@ def through_time(scene: Scene, options: NewtonOptions, thetas: jax.Array) -> Sol
     """
     require_float64("FEM")
     times = thetas[:, scene.parameter_names.index(TIME)]
-    system, equilibrium = _steps_of(scene, options)
+    system, equilibrium = steps_of(scene, options)
     if not is_traced(times):
         _check(scene, np.asarray(times))
 
@@ -356,6 +359,41 @@ def through_time(scene: Scene, options: NewtonOptions, thetas: jax.Array) -> Sol
     first = _at_rest(scene), jnp.asarray(int(Status.CONVERGED))
     solutions: Solution = scan(step, first, (thetas, intervals))[1]
     return solutions
+
+
+def force_through_time(scene: Scene, force: SupportForce) -> ForceThroughTime:
+    """Return the force in mN of a support of a body in time, as a function of where it has been.
+
+    What holds the body balances what the step's tissue, mass and loads do there; the force of
+    springs does not depend on the past.
+
+    force : the force of the support on the body at rest.
+
+    :class:`InputError` for a support by springs at some displacements and held at others.
+    """
+    held, sprung = force.acts_by
+    if held and sprung:
+        raise InputError(
+            f"force of support '{force.name}': a part of it is held and a part is on springs; in "
+            "time give a direction or a set of one of them"
+        )
+    if sprung:
+        return lambda u, thetas: force(u[:, force.nodes], thetas)
+    system, _ = steps_of(scene, NewtonOptions())
+    of_step = SupportForce(system.scene, force.name, force.direction, springs=False)
+
+    def forces(u: jax.Array, thetas: jax.Array) -> jax.Array:
+        def step(past: Past, row: tuple[jax.Array, ...]) -> tuple[Past, jax.Array]:
+            displacement, theta, interval = row
+            whole = _before_step(system, past, theta, interval)
+            value = of_step(displacement[of_step.nodes], whole)
+            return _after_step(system, past, displacement, whole, interval), value
+
+        times = thetas[:, scene.parameter_names.index(TIME)]
+        rows = (u, thetas, jnp.diff(times, prepend=0.0))
+        return jax.lax.scan(step, _at_rest(scene), rows)[1]
+
+    return forces
 
 
 def _check(scene: Scene, times: np.ndarray) -> None:

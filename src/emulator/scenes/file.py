@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -69,10 +70,19 @@ def read_scene(path: str | Path) -> ForwardProblem:
     for name, entry in file.parameters.items():
         with source.at("parameters", name, table=("parameters", name)):
             parameters.append(_parameter(name, entry, limits))
+    if file.history is not None:
+        make = _with_history(path.parent / file.history, source)
     try:
         return make(parameters=tuple(parameters), **entries, **of_body)
     except InputError as error:
         raise source.error(str(error), _quantity_in(str(error), file)) from error
+
+
+def _with_history(table: Path, source: Source) -> Callable[..., ForwardProblem]:
+    """Return the function that makes a body with the history in ``table``."""
+    for body_in_time in offered("emulator.fem.history", "body_in_time"):
+        return partial(body_in_time, table)
+    raise source.error("this needs the room 'emulator.viscosity'", ("history",))
 
 
 def _parameter(name: str, entry: ParameterTable, quantities: Iterable[Quantity]) -> Parameter:

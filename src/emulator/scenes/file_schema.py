@@ -138,6 +138,9 @@ class SceneFile(Table):
     time; without it, both are elastic."""
     inertia: InertiaTable | None = None
     """of a body that goes through time; without it, it has no mass."""
+    history: str | None = None
+    """of a body that goes through time, a table (CSV or spreadsheet) of its times and loads,
+    relative to this file; then time and these loads are no parameters: docs/viscosity.md."""
     parameters: dict[str, ParameterTable]
     """what varies: parameters of the law, of loads and of the stiffness."""
     supports: tuple[Annotated[BoundaryCondition, OneOf("kind", SUPPORTS, "held")], ...] = ()

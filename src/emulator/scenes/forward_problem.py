@@ -44,12 +44,18 @@ class ForwardProblem(TableRepr):
     """A law in tissue, its parameters and constants; the fields are those of the subclasses.
 
     solved_by : the module and the name of the class or function that makes its solver.
+    observed_by : the module and the name of the function that returns the kinds of observation.
+    noun : what it is in a sentence.
+    components : the numbers in a row of an answer that is not the displacement of one mesh; else 0.
     outside : whether a program of somebody else's solves it.
     timed : whether times are a load's, in theta, where something resists motion.
     is_step : whether it is a step of a problem in time, whose past is known.
     """
 
     solved_by: ClassVar[str] = "emulator.fem.simulator:Simulator"
+    observed_by: ClassVar[str] = "calibrate.measurements.words:kinds_of_bodies"
+    noun: ClassVar[str] = "a specimen"
+    components: ClassVar[int] = 0
     outside: ClassVar[bool] = False
     timed: ClassVar[bool] = True
     is_step: ClassVar[bool] = False

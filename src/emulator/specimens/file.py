@@ -22,7 +22,7 @@ if TYPE_CHECKING:  # pydantic is imported when a scene file is read, not with th
 # Keys of files of a mesh that those of a specimen do not have.
 _OF_MESHES = (
     "mesh", "bodies", "regions", "stiffness_modes", "supports", "loads", "order", "dilatation",
-    "inertia", "loaded_by", "node_sets", "facet_sets",
+    "inertia", "history", "loaded_by", "node_sets", "facet_sets",
 )  # fmt: skip
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from argparse import ArgumentParser, Namespace
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,8 +34,8 @@ def simulate(arguments: Namespace) -> Answer:
     from emulator.scenes.scene import Scene, with_mesh
 
     problem = words.problem_of(arguments)
-    if problem.outside:
-        return _run_outside(problem, words.theta_of(arguments, problem))
+    if problem.components:
+        return _run_whole(problem, words.theta_of(arguments, problem))
     if not isinstance(problem, Scene) and not arguments.out:
         return _simulate_states(problem, words.theta_of(arguments, problem))
     scene = with_mesh(problem)
@@ -72,15 +73,18 @@ def _in_a_line(result: dict[str, Any]) -> str:
     return f"{result['scene']}: {status.text}, {result['iterations']} Newton iterations"
 
 
-def _run_outside(problem: ForwardProblem, theta: jax.Array) -> Answer:
-    """Run another program at one theta, and return its outputs."""
+def _run_whole(problem: ForwardProblem, theta: jax.Array) -> Answer:
+    """Run another program, or a history, at one theta, and return what can be seen of it."""
     import numpy as np
 
     from calibrate.measurements.words import kinds_of
     from calibrate.project.problem import simulator_of
 
     u = simulator_of(problem)(theta)
-    parts = {name: kind.of(problem) for name, kind in kinds_of(problem).items()}
+    parts = {}
+    for name, kind in kinds_of(problem).items():
+        with suppress(InputError, TypeError):  # of no argument, or not of this body
+            parts[name] = kind.of(problem)
     outputs = {n: np.asarray(part(u[part.nodes], theta)).tolist() for n, part in parts.items()}
     units = {name: "" if part.unit == "1" else f" {part.unit}" for name, part in parts.items()}
     lines = [f"{name}: {value}{units[name]}" for name, value in outputs.items()]

@@ -147,9 +147,10 @@ def at_once(simulator: EquilibriumSolver, nodes: int | None = None) -> int:
 
     nodes : the number of nodes of the mesh that is solved on; by default the simulator's.
     """
-    if not isinstance(simulator, Simulator) or simulator.stepwise:
+    steps = getattr(simulator, "steps", simulator)  # what goes through a history
+    if not isinstance(steps, Simulator) or steps.stepwise:
         return 1
-    bytes_per_solve = _BYTES_A_NODE * (nodes or len(simulator.scene.mesh.nodes))
+    bytes_per_solve = _BYTES_A_NODE * (nodes or len(steps.scene.mesh.nodes))
     return max(1, int(min(cores(), _MEMORY_SHARE * memory() / bytes_per_solve)))
 
 
