@@ -33,6 +33,7 @@ ROOMS = {
         "emulator.fem.through_time",
         "emulator.fem.history",
         "calibrate.measurements.in_time",
+        "calibrate.statistical_model.finer_history",
         "calibrate.project.viscosity",
     ),
     "fields": (

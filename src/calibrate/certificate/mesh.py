@@ -99,14 +99,14 @@ def mesh_change(
     if time.perf_counter() >= deadline:
         return MeshChange(why="no time was left (--budget)")
     scene = simulator.scene
-    if scene.components:
-        return MeshChange(why=f"it is {scene.noun}, and its mesh is not refined here")
-    if not isinstance(scene, Scene):
+    if not scene.refined_by:
+        return MeshChange(why="its mesh is another program's, which only that one can refine")
+    if not isinstance(scene, Scene) and not scene.components:
         (is_said_even,) = offered("calibrate.statistical_model.gripped_fem", "is_said_even")
         if (even := is_said_even(scene)) is not None:
             said = SAID_HOMOGENEOUS if even else NOBODY_SAID
             return MeshChange(why="its states are homogeneous on any mesh", homogeneous=said)
-    elif not isinstance(simulator, Simulator):
+    elif isinstance(scene, Scene) and not isinstance(simulator, Simulator):
         return MeshChange(why="the simulator is not FEM's")
     try:
         finer = finer_fem(predictive.model, simulator)
@@ -130,7 +130,7 @@ def mesh_change(
         failed=change.failed * states,
         nodes=finer.nodes,
         linear=isinstance(scene, Scene) and scene.mesh.order == 1,
-        gripped=not isinstance(scene, Scene),
+        of=finer.of,
     )
 
 

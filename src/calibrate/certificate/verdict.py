@@ -40,6 +40,7 @@ _MANY = 20.0  # factor in the number of runs above which the estimate of that fa
 _MORE = "more FEM runs (--until decided)"
 _REFINE = "infer on the finer mesh (calibrate infer finer:SCENE)"
 _QUADRATIC = f"make the elements quadratic (order = 2), or {_REFINE}"
+_MORE_ROWS = "give a finer mesh, and rows between those of the history, with nothing measured"
 _LEARN_GRIPS = (
     "calibrate on the gripped piece (calibrate train SCENE --out grips.safetensors, then learned = "
     '"grips.safetensors" under [grips] of the scene)'
@@ -116,6 +117,7 @@ class Certificate(TableRepr):
                 "failed": e.mesh.failed,
                 "not_asked": e.mesh.why,
                 "gripped": e.mesh.gripped,
+                "of": e.mesh.of,
             },
             "box": [asdict(end) for end in e.box],
             "noise": [asdict(noise) for noise in e.noise],
@@ -135,12 +137,17 @@ def _with_errors(name: str, figures: dict[str, Figure]) -> dict[str, dict[str, f
 def shifts(certificate: Mapping[str, Any]) -> dict[str, dict[str, float]]:
     """Return the shifts of means by FEM and by a finer mesh, in sd, from a certificate's JSON.
 
-    A specimen has ``grips`` in place of ``mesh``.
+    A specimen has ``grips`` in place of ``mesh``, a body in time ``mesh and steps``.
     """
     mesh = certificate.get("mesh", {})
-    finer = "grips" if mesh.get("gripped") else "mesh"
+    finer = finer_of(mesh)
     by_cause = {"FEM": certificate.get("shift"), finer: mesh.get("shift")}
     return {cause: shift for cause, shift in by_cause.items() if shift}
+
+
+def finer_of(mesh: Mapping[str, Any]) -> str:
+    """Return what was finer in a certificate's JSON, which earlier versions said otherwise."""
+    return str(mesh.get("of", "grips" if mesh.get("gripped") else "mesh"))
 
 
 def judge(evidence: Evidence) -> Certificate:
@@ -188,7 +195,7 @@ def _mesh(mesh: MeshChange) -> tuple[bool | None, list[Finding]]:
     within = all_within(comparisons := mesh.comparisons())
     if within:
         worst = max(abs(figure.value) for figure in mesh.shift.values())
-        row = "grips" if mesh.gripped else "mesh"
+        row = mesh.of
         words = f"{row}: {finer} no mean would move by more than {worst:.2f} posterior sd"
         return True, [(words, "")]
     decisive = [w for w, figure, limit in comparisons if figure.within(limit) is within]
@@ -196,7 +203,7 @@ def _mesh(mesh: MeshChange) -> tuple[bool | None, list[Finding]]:
         close = f"{finer} the {decisive[0]}, too close to the limit for its error"
         return None, [(close, f"give more runs there (--mesh-runs {2 * mesh.runs})")]
     remedy = _QUADRATIC if mesh.linear else _REFINE
-    remedy = _LEARN_GRIPS if mesh.gripped else remedy
+    remedy = {"grips": _LEARN_GRIPS, "mesh": remedy}.get(mesh.of, _MORE_ROWS)
     return False, _together([f"{finer} the {decisive[0]}", *decisive[1:]], remedy)
 
 

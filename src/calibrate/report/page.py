@@ -18,8 +18,8 @@ from markupsafe import Markup
 
 from calibrate.analysis.identifiability import identify, in_words
 from calibrate.analysis.terms import HeldOut, find_terms
-from calibrate.certificate.evidence import LARGEST_LOG_SD, LARGEST_MESH_SHIFT, LARGEST_SHIFT
-from calibrate.certificate.verdict import NO_TAIL, shifts
+from calibrate.certificate.evidence import LARGEST_LOG_SD, LARGEST_MESH_SHIFT, LARGEST_SHIFT, WHERE
+from calibrate.certificate.verdict import NO_TAIL, finer_of, shifts
 from calibrate.posterior import Posterior
 from calibrate.priors.population import in_words as priors_in_words
 from calibrate.priors.priors import Truncated
@@ -122,7 +122,7 @@ def _verdict(
 def _basis(certificate: dict[str, Any]) -> Iterator[str]:
     """Yield sentences on the evidence behind a verdict, and on its limits."""
     mesh = certificate.get("mesh") or {}
-    where = "between the grips" if mesh.get("gripped") else "on a finer mesh"
+    where = WHERE[finer_of(mesh)]
     runs = f"Judged by {certificate['draws']} FEM runs, {certificate['failed']} failed"
     yield f"{runs}, and {mesh['runs']} {where}." if mesh.get("runs") else f"{runs}."
     k, most = certificate["k_hat"], certificate["k_threshold"]

@@ -40,7 +40,13 @@ class MeshPair(NamedTuple):
 
 
 class FinerFEM(Protocol):
-    """FEM of higher fidelity than a model's simulator."""
+    """FEM of higher fidelity than a model's simulator.
+
+    of : the word for what is finer: ``mesh``, ``grips``, ``steps``, ``mesh and steps``.
+    """
+
+    @property
+    def of(self) -> str: ...  # noqa: D102
 
     @property
     def nodes(self) -> int:
@@ -74,8 +80,9 @@ def finer_fem(model: Model, simulator: EquilibriumSolver) -> FinerFEM:
         cannot have, or an observation that says nothing of grips.
     """
     if not isinstance(simulator.scene, Scene):
-        (gripped_fem,) = offered("calibrate.statistical_model.gripped_fem", "gripped_fem")
-        return gripped_fem(model, simulator)
+        (of_problem,) = offered(*simulator.scene.refined_by.split(":"))
+        finer: FinerFEM = of_problem(model, simulator)
+        return finer
     error = mesh_error(cast(Simulator, simulator))
     return _OnFinerMesh(model, error, on_finer(error, model.observe))
 
@@ -93,6 +100,8 @@ class _OnFinerMesh:
     model: Model
     error: MeshError
     observe: Observations
+
+    of = "mesh"
 
     @property
     def nodes(self) -> int:

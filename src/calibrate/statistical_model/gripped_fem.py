@@ -36,6 +36,8 @@ class GrippedFEM:
     model: Model
     gripped: GrippedSpecimen
 
+    of = "grips"
+
     @property
     def nodes(self) -> int:
         """The largest number of nodes of a piece."""

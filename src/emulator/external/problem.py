@@ -140,6 +140,7 @@ class ExternalProblem(ForwardProblem):
 
     solved_by = "emulator.external.solver:ExternalSimulator"
     observed_by = "calibrate.external.outputs:kinds_of_outputs"
+    refined_by = ""
     noun = "another program's"
     components = 1
     outside = True

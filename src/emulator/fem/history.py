@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -31,6 +31,7 @@ from emulator.core.units import IN_KPA, factor, with_unit
 from emulator.fem.newton import NewtonOptions
 from emulator.fem.simulator import Simulator
 from emulator.fem.solution import Solution, Status
+from emulator.geometry.io import write_solution
 from emulator.mechanics.laws import Law
 from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.forward_problem import ForwardProblem, Owners
@@ -68,6 +69,7 @@ class BodyInTime(ForwardProblem):
 
     solved_by = "emulator.fem.history:HistorySolver"
     observed_by = "calibrate.measurements.in_time:kinds_in_time"
+    refined_by = "calibrate.statistical_model.finer_history:finer_history"
     noun = "a body in time"
     components = 3
 
@@ -106,6 +108,17 @@ class BodyInTime(ForwardProblem):
     def rows_of(self, u: jax.Array) -> jax.Array:
         """Return the displacement (..., m, k, 3) of nodes, from that of all rows, (..., m k, 3)."""
         return u.reshape(*u.shape[:-2], len(self.times), -1, 3)
+
+    @property
+    def halved(self) -> BodyInTime:
+        """The body with a row halfway to each of its rows, which are 1, 3, 5, ... then."""
+        known = {name: np.repeat(values, 2) for name, values in self.known.items()}
+        for rows in self.tests.values():
+            for name, values in self.known.items():
+                before = np.concatenate([[0.0], values[rows][:-1]])
+                known[name][2 * rows] = 0.5 * (before + values[rows])
+        tests = {n: np.column_stack([2 * t, 2 * t + 1]).ravel() for n, t in self.tests.items()}
+        return replace(self, known=known, tests=tests, table=None)
 
     def thetas(self, theta: jax.Array) -> jax.Array:
         """Return the scene's theta at every row, (m, q), from the tissue's theta (p,)."""
@@ -279,6 +292,29 @@ def body_in_time(path: Path, parameters: tuple[Parameter, ...], **entries: Any) 
     scene = Scene(parameters=(*parameters, *of_history), **entries)
     origin = entries.get("origin", {})
     return BodyInTime(scene.name, scene, parameters, known, _tests(cells), cells, origin)
+
+
+def half_steps_error(body: BodyInTime, u: jax.Array, theta: jax.Array) -> float:
+    """Return by how much steps half as long move a node from ``u`` (n, 3) at most, in mm."""
+    finer = body.halved
+    other = finer.rows_of(HistorySolver(finer)(theta))[1::2]
+    return float(jnp.linalg.norm(other - body.rows_of(u), axis=-1).max())
+
+
+def write_history(path: str | Path, body: BodyInTime, u: jax.Array) -> Path:
+    """Write the displacement (n, 3) mm as a VTU of each row, and a list of them with their times.
+
+    Return the list, a .pvd beside ``path``, which programs such as ParaView play.
+    """
+    path, lines = Path(path), list[str]()
+    for row, shape in enumerate(np.asarray(body.rows_of(u))):
+        file = path.with_name(f"{path.stem}_{row + 1}.vtu")
+        write_solution(file, body.scene.mesh, shape, {})
+        lines.append(f'<DataSet timestep="{body.times[row]:g}" file="{file.name}"/>')
+    listing = path.with_suffix(".pvd")
+    whole = ['<VTKFile type="Collection" version="0.1"><Collection>', *lines]
+    listing.write_text("\n".join([*whole, "</Collection></VTKFile>", ""]))
+    return listing
 
 
 def _cells(path: Path) -> Cells:

@@ -45,6 +45,8 @@ class ForwardProblem(TableRepr):
 
     solved_by : the module and the name of the class or function that makes its solver.
     observed_by : the module and the name of the function that returns the kinds of observation.
+    refined_by : the module and the name of the function that returns FEM of higher fidelity; empty
+        where there is none.
     noun : what it is in a sentence.
     components : the numbers in a row of an answer that is not the displacement of one mesh; else 0.
     outside : whether a program of somebody else's solves it.
@@ -54,6 +56,7 @@ class ForwardProblem(TableRepr):
 
     solved_by: ClassVar[str] = "emulator.fem.simulator:Simulator"
     observed_by: ClassVar[str] = "calibrate.measurements.words:kinds_of_bodies"
+    refined_by: ClassVar[str] = "calibrate.statistical_model.gripped_fem:gripped_fem"
     noun: ClassVar[str] = "a specimen"
     components: ClassVar[int] = 0
     outside: ClassVar[bool] = False

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from argparse import ArgumentParser, Namespace
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,8 +33,10 @@ def simulate(arguments: Namespace) -> Answer:
     from emulator.scenes.scene import Scene, with_mesh
 
     problem = words.problem_of(arguments)
+    if problem.outside:
+        return _run_outside(problem, words.theta_of(arguments, problem))
     if problem.components:
-        return _run_whole(problem, words.theta_of(arguments, problem))
+        return _run_history(problem, words.theta_of(arguments, problem), arguments.out)
     if not isinstance(problem, Scene) and not arguments.out:
         return _simulate_states(problem, words.theta_of(arguments, problem))
     scene = with_mesh(problem)
@@ -73,22 +74,52 @@ def _in_a_line(result: dict[str, Any]) -> str:
     return f"{result['scene']}: {status.text}, {result['iterations']} Newton iterations"
 
 
-def _run_whole(problem: ForwardProblem, theta: jax.Array) -> Answer:
-    """Run another program, or a history, at one theta, and return what can be seen of it."""
+def _run_outside(problem: ForwardProblem, theta: jax.Array) -> Answer:
+    """Run another program at one theta, and return its outputs."""
     import numpy as np
 
     from calibrate.measurements.words import kinds_of
     from calibrate.project.problem import simulator_of
 
     u = simulator_of(problem)(theta)
-    parts = {}
-    for name, kind in kinds_of(problem).items():
-        with suppress(InputError, TypeError):  # of no argument, or not of this body
-            parts[name] = kind.of(problem)
+    parts = {name: kind.of(problem) for name, kind in kinds_of(problem).items()}
     outputs = {n: np.asarray(part(u[part.nodes], theta)).tolist() for n, part in parts.items()}
     units = {name: "" if part.unit == "1" else f" {part.unit}" for name, part in parts.items()}
     lines = [f"{name}: {value}{units[name]}" for name, value in outputs.items()]
     return Answer({"scene": problem.name, "outputs": outputs}, "\n".join(lines))
+
+
+def _run_history(problem: Any, theta: jax.Array, out: str | None) -> Answer:
+    """Go through a history at one theta; find the motion at each row, and the error of the steps.
+
+    out : the file of the series of shapes, or None.
+    """
+    import numpy as np
+
+    from calibrate.cli.output import table
+    from calibrate.project.problem import simulator_of
+    from emulator.fem.history import half_steps_error, write_history
+
+    if out:
+        words.check_vtu(out)
+    u = simulator_of(problem)(theta)
+    largest = np.linalg.norm(problem.rows_of(u), axis=-1).max(axis=-1)
+    error = half_steps_error(problem, u, theta)
+    columns = {name: values.tolist() for name, values in problem.known.items()}
+    columns["largest displacement (mm)"] = largest.tolist()
+    if len(problem.tests) > 1:
+        names = {int(row): name for name, rows in problem.tests.items() for row in rows}
+        columns = {"test": [names[row] for row in range(len(names))]} | columns
+    lines = [table(list(columns), list(zip(*columns.values(), strict=True)))]
+    lines.append(
+        f"steps half as long move a node by {error:.2g} mm at most, "
+        f"{100.0 * error / largest.max():.2g} % of the largest displacement"
+    )
+    if out:
+        lines.append(f"shapes of all rows: {write_history(out, problem, u)}")
+    return Answer(
+        {"scene": problem.name, "rows": columns, "half_steps_mm": error}, "\n".join(lines)
+    )
 
 
 def _simulate_states(problem: ForwardProblem, theta: jax.Array) -> Answer:
