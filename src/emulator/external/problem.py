@@ -141,7 +141,7 @@ class ExternalProblem(ForwardProblem):
     solved_by = "emulator.external.solver:ExternalSimulator"
     observed_by = "calibrate.external.outputs:kinds_of_outputs"
     refined_by = ""
-    noun = "another program's"
+    noun = "another program's, which has no mesh here"
     components = 1
     outside = True
 

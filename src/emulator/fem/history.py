@@ -70,20 +70,14 @@ class BodyInTime(ForwardProblem):
     solved_by = "emulator.fem.history:HistorySolver"
     observed_by = "calibrate.measurements.in_time:kinds_in_time"
     refined_by = "calibrate.statistical_model.finer_history:finer_history"
-    noun = "a body in time"
+    noun = "a body that goes through a history"
     components = 3
 
     def __post_init__(self) -> None:
         for name in ("known", "tests", "origin"):
             object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
-        if not self.scene.in_time:
-            raise InputError(
-                f"scene '{self.name}': nothing in it depends on time, and it has a history; give "
-                "[viscosity], [inertia] or dashpots, or leave the history out"
-            )
         if not self.parameters:
             raise InputError("no parameter varies, nothing to calibrate")
-        check_times(self.known[TIME], self.tests, len(self.known[TIME]))
 
     @property
     def constants(self) -> Mapping[str, float]:  # type: ignore[override]
@@ -271,7 +265,7 @@ def body_in_time(path: Path, parameters: tuple[Parameter, ...], **entries: Any) 
     InputError
         No times, a time that falls, a cell that is no number, a parameter that is in the table too.
     """
-    cells = _cells(path)
+    cells = read_cells(path, unloading=True)
     parts = (*entries.get("loads", ()), *entries.get("supports", ()))
     taken = {quantity.name: quantity for part in parts for quantity in part.quantities}
     known = {TIME: read_times(cells)} | {
@@ -279,6 +273,14 @@ def body_in_time(path: Path, parameters: tuple[Parameter, ...], **entries: Any) 
         for word, (name, _) in ((word, with_unit(word)) for word in cells.words)
         if name in taken
     }
+    rates = any(support.resists_velocity for support in entries.get("supports", ()))
+    if not rates and entries.get("viscosity") is None and entries.get("inertia") is None:
+        raise InputError(
+            f"nothing in it depends on time, and it has the history {path.name}; give [viscosity], "
+            "[inertia] or dashpots, or leave the history out"
+        )
+    tests = _tests(cells)
+    check_times(known[TIME], tests, len(known[TIME]))
     for parameter in parameters:
         if parameter.name in known:
             raise InputError(
@@ -291,7 +293,7 @@ def body_in_time(path: Path, parameters: tuple[Parameter, ...], **entries: Any) 
     ]
     scene = Scene(parameters=(*parameters, *of_history), **entries)
     origin = entries.get("origin", {})
-    return BodyInTime(scene.name, scene, parameters, known, _tests(cells), cells, origin)
+    return BodyInTime(scene.name, scene, parameters, known, tests, _cells(path), origin)
 
 
 def half_steps_error(body: BodyInTime, u: jax.Array, theta: jax.Array) -> float:

@@ -205,7 +205,9 @@ class SupportForce:
             return force_on_body(local, u, values) + jnp.zeros_like(u)
 
         loads, springs = self._parts
-        bulk = jax.jvp(strain_energy_at_support, (u,), (prescribed,))[1]
+        bulk = jnp.zeros(())
+        if self.acts_by[0]:
+            bulk = jax.jvp(strain_energy_at_support, (u,), (prescribed,))[1]
         others = force_of(loads) + self._dead.total(values) + (by_springs := force_of(springs))
         return bulk - jnp.vdot(others, prescribed) + jnp.vdot(by_springs, sprung)
 

@@ -47,7 +47,7 @@ class ForwardProblem(TableRepr):
     observed_by : the module and the name of the function that returns the kinds of observation.
     refined_by : the module and the name of the function that returns FEM of higher fidelity; empty
         where there is none.
-    noun : what it is in a sentence.
+    noun : what it is, where a mesh at rest is asked for.
     components : the numbers in a row of an answer that is not the displacement of one mesh; else 0.
     outside : whether a program of somebody else's solves it.
     timed : whether times are a load's, in theta, where something resists motion.
@@ -57,7 +57,7 @@ class ForwardProblem(TableRepr):
     solved_by: ClassVar[str] = "emulator.fem.simulator:Simulator"
     observed_by: ClassVar[str] = "calibrate.measurements.words:kinds_of_bodies"
     refined_by: ClassVar[str] = "calibrate.statistical_model.gripped_fem:gripped_fem"
-    noun: ClassVar[str] = "a specimen"
+    noun: ClassVar[str] = "a specimen, which has no mesh"
     components: ClassVar[int] = 0
     outside: ClassVar[bool] = False
     timed: ClassVar[bool] = True

@@ -181,8 +181,7 @@ def with_mesh(problem: ForwardProblem) -> Scene:
     """Return ``problem`` if it is a scene; :class:`InputError` for a specimen."""
     if not isinstance(problem, Scene):
         raise InputError(
-            f"scene '{problem.name}' is {problem.noun}, which has no mesh of its own; simulate, "
-            "infer, certify and report take it"
+            f"scene '{problem.name}' is {problem.noun}; simulate, infer, certify and report take it"
         )
     return problem
 

@@ -262,6 +262,8 @@ def specimen(
 def require_specimen(problem: ForwardProblem) -> Specimen:
     """Return ``problem`` if it is a specimen; :class:`InputError` for a scene."""
     if not isinstance(problem, Specimen):
+        if problem.components:
+            raise InputError(f"scene '{problem.name}' is {problem.noun}, and no specimen")
         raise InputError(f"scene '{problem.name}' is no specimen: give a table of its states")
     return problem
 

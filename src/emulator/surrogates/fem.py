@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from typing import cast
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emulator.core.errors import InputError
 from emulator.core.store import to_json
 from emulator.fem.campaign import Row, Solver, solve_rows
-from emulator.fem.simulator import Simulator
 from emulator.fem.solution import EquilibriumSolver
-from emulator.scenes.scene import Scene, all_nodes, check_nodes
+from emulator.scenes.forward_problem import ForwardProblem
+from emulator.scenes.scene import all_nodes, check_nodes
 from emulator.surrogates.protocol import ForwardKind, ForwardMap, Prediction, fingerprint_of
 
 
@@ -28,7 +29,7 @@ class FEMForward:
     start : the map that predicts where Newton's method begins; ``None`` for the body at rest.
     """
 
-    simulator: Simulator
+    simulator: EquilibriumSolver
     nodes: np.ndarray
     start: ForwardMap | None = None
 
@@ -36,14 +37,14 @@ class FEMForward:
     label = "FEM"
 
     @cached_property
-    def scene(self) -> Scene:
-        """The scene that is simulated."""
+    def scene(self) -> ForwardProblem:
+        """The scene or the history that is simulated."""
         return self.simulator.scene
 
     @cached_property
     def fingerprint(self) -> str:
         """Short hash of scene, solver options and nodes; ``start`` only affects the time taken."""
-        options = to_json(asdict(self.simulator.options))
+        options = to_json(asdict(cast(Any, self.simulator).options))
         return fingerprint_of(self.kind, self.scene.fingerprint, options, self.nodes)
 
     def evaluate(self, theta: jax.Array) -> Prediction:
@@ -81,16 +82,22 @@ class FEMForward:
         return replace(self, nodes=check_nodes(self.scene, nodes))
 
 
-def fem_forward(simulator: Simulator, start: ForwardMap | None = None) -> FEMForward:
+def fem_forward(simulator: EquilibriumSolver, start: ForwardMap | None = None) -> FEMForward:
     """Return the simulator as a forward map over all nodes; ``start`` predicts its starts."""
     return FEMForward(simulator, all_nodes(simulator.scene), start)
 
 
 def by_solver(solver: EquilibriumSolver, start: ForwardMap | None = None) -> ForwardMap:
-    """Return ``solver`` as a forward map over all nodes; that of a specimen is one already."""
-    if isinstance(solver.scene, Scene):
-        return fem_forward(cast(Simulator, solver), start)
-    return cast(ForwardMap, solver)
+    """Return ``solver`` as a forward map over all nodes; that of a specimen is one already.
+
+    :class:`InputError` for another program, through which a sampler cannot differentiate.
+    """
+    if solver.scene.outside:
+        raise InputError(
+            f"forward map 'fem': '{solver.scene.name}' is {solver.scene.noun}, and a sampler needs "
+            "derivatives within its steps; leave --forward out, and runs of it teach a map"
+        )
+    return cast(ForwardMap, solver) if hasattr(solver, "at") else fem_forward(solver, start)
 
 
 FEM = ForwardKind(

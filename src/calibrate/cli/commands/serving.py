@@ -76,7 +76,7 @@ def serve(arguments: Namespace) -> Answer:
     from calibrate.um_bridge import NAME, serve
     from emulator.catalogue import find_scene
     from emulator.fem import Simulator
-    from emulator.scenes.scene import cavity_sets
+    from emulator.scenes.scene import cavity_sets, with_mesh
     from emulator.surrogates.fem import fem_forward
     from emulator.surrogates.protocol import ForwardMap
 
@@ -87,7 +87,7 @@ def serve(arguments: Namespace) -> Answer:
         forward = fem_forward(Simulator(find_scene(arguments.body)))
     else:
         forward = _emulator_of(arguments).cache()
-    scene = forward.scene
+    scene = with_mesh(forward.scene)
     default = "volume" if cavity_sets(scene) else "landmarks:24"
     observe = parse_observation(scene, arguments.observe or default)
     server = serve(forward, observe, arguments.port, arguments.host)
