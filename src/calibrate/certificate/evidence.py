@@ -113,7 +113,8 @@ class MeshChange(Changes):
     nodes : the number of nodes of the finer mesh.
     runs, failed : the numbers of solves on the finer mesh, and of those that did not converge.
     linear : whether the coarser mesh has linear elements.
-    of : what was finer: ``mesh``, ``grips`` of a specimen, ``steps`` in time, ``mesh and steps``.
+    of, where : what was finer, ``mesh``, ``grips`` of a specimen, ``steps`` in time or ``mesh and
+        steps``, and the place of the solves in words.
     why : the reason for which no finer mesh was solved; empty if one was.
     homogeneous : of a specimen without grips, in words, who says that it deforms evenly.
     """
@@ -123,18 +124,14 @@ class MeshChange(Changes):
     failed: int = 0
     linear: bool = False
     of: str = "mesh"
+    where: str = "on a finer mesh"
     why: str = ""
     homogeneous: str = ""
 
     @property
     def place(self) -> str:
         """The place of the solves in words."""
-        return f"{WHERE[self.of]} ({self.nodes} nodes)"
-
-    @property
-    def gripped(self) -> bool:
-        """Whether the finer mesh is of a specimen between its grips."""
-        return self.of == "grips"
+        return f"{self.where} ({self.nodes} nodes)"
 
     def comparisons(self) -> list[Comparison]:
         """Return every figure with its limit."""
@@ -144,14 +141,6 @@ class MeshChange(Changes):
             *((f"sd of {n} would change by a factor of {np.exp(f.value):.2f}", f,
                LARGEST_MESH_LOG_SD) for n, f in self.log_sd.items()),
         ]  # fmt: skip
-
-
-WHERE = {
-    "mesh": "on a finer mesh",
-    "grips": "between its grips",
-    "steps": "in steps half as long",
-    "mesh and steps": "on a finer mesh, in steps half as long",
-}
 
 
 @dataclass(frozen=True)

@@ -53,6 +53,14 @@ _MARGIN = 2.0  # factor between a figure and its limit at which few points decid
 _CANDIDATES = 4  # draws of which one is taken
 _ROUNDS = 12  # steps of the pool towards a posterior that may be many sd away
 
+WHERE = {
+    "mesh": "on a finer mesh",
+    "grips": "between its grips",
+    "steps": "in steps half as long",
+    "mesh and steps": "on a finer mesh, in steps half as long",
+}
+"""The place of the solves in words, by what is finer."""
+
 Differences = Callable[[np.ndarray], Iterable[np.ndarray | None]]
 """FEM's data on a finer mesh less those on the mesh, flat (m,), of each point z (k, p).
 
@@ -61,6 +69,11 @@ None where FEM failed on one of the meshes.
 
 CorrectionBy = Callable[..., tuple[Correction, Correction]]
 """Points and differences to the map's correction and the differences' own: `_corrections_by`."""
+
+
+def finer_of(mesh: Mapping[str, Any]) -> str:
+    """Return what was finer in a certificate's JSON, which earlier versions said otherwise."""
+    return str(mesh.get("of", "grips" if mesh.get("gripped") else "mesh"))
 
 
 def points_for(unknowns: int, states: int, most: int | None) -> tuple[int, int]:
@@ -131,6 +144,7 @@ def mesh_change(
         nodes=finer.nodes,
         linear=isinstance(scene, Scene) and scene.mesh.order == 1,
         of=finer.of,
+        where=WHERE[finer.of],
     )
 
 

@@ -16,6 +16,7 @@ from calibrate.certificate.evidence import (
     Tail,
     all_within,
 )
+from calibrate.certificate.mesh import finer_of
 from calibrate.posterior.box import in_words
 from calibrate.posterior.diagnosis import SMALLEST_P, closer_map, map_fault, sampling_faults
 from emulator.core.display import TableRepr
@@ -116,7 +117,6 @@ class Certificate(TableRepr):
                 "runs": e.mesh.runs,
                 "failed": e.mesh.failed,
                 "not_asked": e.mesh.why,
-                "gripped": e.mesh.gripped,
                 "of": e.mesh.of,
             },
             "box": [asdict(end) for end in e.box],
@@ -140,14 +140,8 @@ def shifts(certificate: Mapping[str, Any]) -> dict[str, dict[str, float]]:
     A specimen has ``grips`` in place of ``mesh``, a body in time ``mesh and steps``.
     """
     mesh = certificate.get("mesh", {})
-    finer = finer_of(mesh)
-    by_cause = {"FEM": certificate.get("shift"), finer: mesh.get("shift")}
+    by_cause = {"FEM": certificate.get("shift"), finer_of(mesh): mesh.get("shift")}
     return {cause: shift for cause, shift in by_cause.items() if shift}
-
-
-def finer_of(mesh: Mapping[str, Any]) -> str:
-    """Return what was finer in a certificate's JSON, which earlier versions said otherwise."""
-    return str(mesh.get("of", "grips" if mesh.get("gripped") else "mesh"))
 
 
 def judge(evidence: Evidence) -> Certificate:
@@ -190,7 +184,7 @@ def _mesh(mesh: MeshChange) -> tuple[bool | None, list[Finding]]:
     if not mesh.shift:
         failed = f"FEM failed at {mesh.failed} of {mesh.runs} points {finer}"
         return None, [
-            (failed, "check the size of the piece" if mesh.gripped else "refine the mesh")
+            (failed, "check the size of the piece" if mesh.of == "grips" else "refine the mesh")
         ]
     within = all_within(comparisons := mesh.comparisons())
     if within:

@@ -18,8 +18,9 @@ from markupsafe import Markup
 
 from calibrate.analysis.identifiability import identify, in_words
 from calibrate.analysis.terms import HeldOut, find_terms
-from calibrate.certificate.evidence import LARGEST_LOG_SD, LARGEST_MESH_SHIFT, LARGEST_SHIFT, WHERE
-from calibrate.certificate.verdict import NO_TAIL, finer_of, shifts
+from calibrate.certificate.evidence import LARGEST_LOG_SD, LARGEST_MESH_SHIFT, LARGEST_SHIFT
+from calibrate.certificate.mesh import WHERE, finer_of
+from calibrate.certificate.verdict import NO_TAIL, shifts
 from calibrate.posterior import Posterior
 from calibrate.priors.population import in_words as priors_in_words
 from calibrate.priors.priors import Truncated

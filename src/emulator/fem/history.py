@@ -26,11 +26,11 @@ import numpy as np
 from emulator.core.cells import PROTOCOL, Cells, read_cells
 from emulator.core.engine import STAYS, Engine, engine_of
 from emulator.core.errors import InputError, SolverError
-from emulator.core.kept import kept
 from emulator.core.units import IN_KPA, factor, with_unit
 from emulator.fem.newton import NewtonOptions
 from emulator.fem.simulator import Simulator
 from emulator.fem.solution import Solution, Status
+from emulator.fem.through_time import slopes_through_time, steps_of
 from emulator.geometry.io import write_solution
 from emulator.mechanics.laws import Law
 from emulator.mechanics.laws.law import Quantity
@@ -190,6 +190,11 @@ class HistorySolver:
         """The engine that does many solves; None for threads of this process."""
         return engine_of(self.executor)
 
+    @property
+    def stepwise(self) -> bool:
+        """Whether a factor is kept between solves, as on a large mesh."""
+        return steps_of(self.scene.scene, self.options)[0].kept is not None
+
     @cached_property
     def steps(self) -> Simulator:
         """The simulator that goes through the times."""
@@ -219,12 +224,19 @@ class HistorySolver:
             return solution.displacement
         return solution.require_converged(f"a step of '{self.scene.name}'").displacement
 
-    def sensitivities(self, u: jax.Array, theta: jax.Array) -> jax.Array:  # noqa: ARG002
-        """Return the derivatives (p, n, 3) of the displacements of all rows in ``theta`` (p,)."""
-        slopes = _slopes(self.scene, self.steps)(jnp.asarray(theta, dtype=float))
+    def sensitivities(self, u: jax.Array, theta: jax.Array) -> jax.Array:
+        """Return the derivatives (p, n, 3) of the displacements ``u`` (n, 3) mm of all rows."""
+        body, rows = self.scene, self.scene.rows_of(u)
+        directions = jax.jacfwd(body.thetas)(theta)[0].T  # the same at every row
+        slopes, thetas = jnp.zeros((len(directions), *rows.shape)), body.thetas(theta)
+        for test in body.tests.values():
+            of_test = slopes_through_time(
+                body.scene, self.options, rows[test], thetas[test], directions
+            )
+            slopes = slopes.at[:, test].set(of_test)
         if not np.isfinite(slopes).all():
-            raise SolverError(f"the derivatives of '{self.scene.name}' are not finite")
-        return slopes
+            raise SolverError(f"a step of '{body.name}' has no derivatives: singular tangent")
+        return slopes.reshape(len(directions), *u.shape)
 
     def is_stable(self, u: jax.Array, theta: jax.Array) -> bool | None:  # noqa: ARG002
         """Return None: a step is a minimum given its past, which says nothing of another past."""
@@ -238,16 +250,6 @@ def _along(body: BodyInTime, simulator: Simulator, theta: jax.Array) -> Solution
     paths = [simulator.path(thetas[test]) for test in body.tests.values()]
     joined = jax.tree.map(lambda *parts: jnp.concatenate(parts), *paths)
     return cast(Solution, jax.tree.map(lambda values: values[np.argsort(rows)], joined))
-
-
-@kept
-def _slopes(body: BodyInTime, simulator: Simulator) -> Any:
-    """Return the program for the derivatives (p, n, 3) of all rows in theta (p,)."""
-
-    def displacement(theta: jax.Array) -> jax.Array:
-        return _along(body, simulator, theta).displacement.reshape(-1, 3)
-
-    return jax.jit(lambda theta: jnp.moveaxis(jax.jacfwd(displacement)(theta), -1, 0))
 
 
 def body_in_time(path: Path, parameters: tuple[Parameter, ...], **entries: Any) -> BodyInTime:

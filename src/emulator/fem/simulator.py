@@ -100,9 +100,6 @@ class Simulator(TableRepr):
     @property
     def stepwise(self) -> bool:
         """Solves from Python go step by step where a factor is kept."""
-        if self.scene.in_time:
-            of_steps = import_module("emulator.fem.through_time").steps_of  # a room
-            return of_steps(self.scene, self.options)[0].kept is not None
         return not self.scene.loaded_by and self.system.kept is not None
 
     @property

@@ -40,7 +40,7 @@ from emulator.core.kept import kept
 from emulator.core.machine import require_float64
 from emulator.fem.assembly import System
 from emulator.fem.compiled import compiled, is_traced, scan
-from emulator.fem.derivatives import SolutionMap, differentiable
+from emulator.fem.derivatives import SolutionMap, derivatives_along, differentiable
 from emulator.fem.energy import at_points, law_gradients, parameters_at
 from emulator.fem.newton import NewtonOptions
 from emulator.fem.reactions import SupportForce
@@ -359,6 +359,73 @@ def through_time(scene: Scene, options: NewtonOptions, thetas: jax.Array) -> Sol
     first = _at_rest(scene), jnp.asarray(int(Status.CONVERGED))
     solutions: Solution = scan(step, first, (thetas, intervals))[1]
     return solutions
+
+
+def slopes_through_time(
+    scene: Scene, options: NewtonOptions, u: jax.Array, thetas: jax.Array, directions: jax.Array
+) -> jax.Array:
+    """Return the derivatives (k, m, n, 3) of equilibria along directions that all times share.
+
+    Step by step, by one tangent for all directions. For numbers; under ``jit`` differentiate
+    :func:`through_time`.
+
+    Parameters
+    ----------
+    u : the equilibria, (m, n, 3) mm.
+    thetas : theta at each time, (m, p).
+    directions : the directions in theta, (k, p).
+    """
+    system, _ = steps_of(scene, options)
+    past = _at_rest(scene)
+    along = jax.tree.map(lambda field: jnp.zeros((len(directions), *field.shape)), past)
+    intervals = jnp.diff(thetas[:, scene.parameter_names.index(TIME)], prepend=0.0)
+    slopes = list[jax.Array]()
+    for row, theta, interval in zip(u, thetas, intervals, strict=True):
+        whole, change = _before_step_along(system, past, theta, interval, along, directions)
+        tangent = system.safe_tangent(row, whole)[0]
+        slopes.append(derivatives_along(system, tangent, row, whole, change))
+        past, along = _after_step_along(
+            system, past, row, whole, interval, along, slopes[-1], change
+        )
+    return jnp.stack(slopes, axis=1)
+
+
+@compiled
+def _before_step_along(
+    system: System,
+    past: Past,
+    theta: jax.Array,
+    interval: jax.Array,
+    along: Past,
+    directions: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """Return :func:`_before_step`, and its derivatives along (k, ...) the past's and theta's."""
+
+    def before(past: Past, theta: jax.Array) -> jax.Array:
+        return _before_step(system, past, theta, interval)
+
+    derivative = jax.vmap(lambda *change: jax.jvp(before, (past, theta), change)[1])
+    return before(past, theta), derivative(along, directions)
+
+
+@compiled
+def _after_step_along(
+    system: System,
+    past: Past,
+    u: jax.Array,
+    theta: jax.Array,
+    interval: jax.Array,
+    along: Past,
+    du: jax.Array,
+    dtheta: jax.Array,
+) -> tuple[Past, Past]:
+    """Return :func:`_after_step`, and its derivatives along those of its arguments, (k, ...)."""
+
+    def after(past: Past, u: jax.Array, theta: jax.Array) -> Past:
+        return _after_step(system, past, u, theta, interval)
+
+    derivative = jax.vmap(lambda *change: jax.jvp(after, (past, u, theta), change)[1])
+    return after(past, u, theta), derivative(along, du, dtheta)
 
 
 def force_through_time(scene: Scene, force: SupportForce) -> ForceThroughTime:

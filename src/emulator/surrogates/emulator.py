@@ -61,16 +61,13 @@ if TYPE_CHECKING:
 FORMAT = 3
 """The format of files: ``emulator.json`` describes, ``weights.safetensors`` has the arrays."""
 
+_FAMILY = offered("emulator.surrogates.network.family", "FamilyNetwork")
 PARTS: dict[str, type[EmulatorPart]] = {
     "coarse": Coarse,
     "taylor": Expansion,
     "polynomial": Polynomial,
     "network": Network,
-    **dict(
-        zip(
-            ["family"], offered("emulator.surrogates.network.family", "FamilyNetwork"), strict=False
-        )
-    ),
+    **dict(zip(["family"], _FAMILY, strict=False)),
     "discrepancy": Discrepancy,
 }
 """The kinds of parts in the order of the sum, by the field of :class:`Emulator`."""

@@ -14,7 +14,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -148,7 +148,7 @@ def at_once(simulator: EquilibriumSolver, nodes: int | None = None) -> int:
     nodes : the number of nodes of the mesh that is solved on; by default the simulator's.
     """
     steps = getattr(simulator, "steps", simulator)  # what goes through a history
-    if not isinstance(steps, Simulator) or steps.stepwise:
+    if not isinstance(steps, Simulator) or cast(Any, simulator).stepwise:
         return 1
     bytes_per_solve = _BYTES_A_NODE * (nodes or len(steps.scene.mesh.nodes))
     return max(1, int(min(cores(), _MEMORY_SHARE * memory() / bytes_per_solve)))
