@@ -75,6 +75,7 @@ def posterior_summary(report: Mapping[str, Any]) -> str:
         )
     if shifts_by_judge:
         finer = "FEM between the grips" if "grips" in shifts_by_judge else "a finer mesh"
+        finer += ", in steps half as long" if "mesh and steps" in shifts_by_judge else ""
         judges = ", ".join(shifts_by_judge)
         lines.append(f"{judges}: how far FEM, and {finer}, would move each mean, in sd")
     lines += in_words(report.get("priors", {}))

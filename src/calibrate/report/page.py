@@ -41,11 +41,7 @@ from emulator.surrogates import CachedEmulator
 
 _CALLS = 50  # of a likelihood, timed together
 _SHEET = 0.1  # thickness of a sheet, as a share of its width
-_SHIFTS = {
-    "FEM": "by FEM / sd",
-    "mesh": "on a finer mesh / sd",
-    "grips": "between its grips / sd",
-}
+_SHIFTS = {"FEM": "by FEM / sd"} | {of: f"{where} / sd" for of, where in WHERE.items()}
 
 
 def write_page(folder: str | Path, out: str | Path | None, *, fem: bool) -> Path:

@@ -3,7 +3,6 @@
 import csv
 import json
 
-import meshio
 import numpy as np
 import pytest
 
@@ -11,23 +10,20 @@ from calibrate.cli import main
 from calibrate.measurements import leave_out_missing
 from calibrate.project import Run, read_posterior, read_problem
 from cli_support import answer, complaint
-from emulator.geometry.generators.box import box
+from history_support import BY_GRIP, CUBE, write_cube
 
-SCENE = """
-law = "neo_hookean_split"
-mesh = "cube.vtu"
-history = "history.csv"
-viscosity = {kind = "prony"}
-node_sets = {left = {axis = "x", at = 0.0}, front = {axis = "y", at = 0.0}, floor = {axis = "z", \
-at = 0.0}, end = {axis = "x", at = 1.0}}
-constants = {kappa = 100.0, tau_1 = 2.0}
-supports = [{node_set = "left", components = "x"}, {node_set = "front", components = "y"}, \
-{node_set = "floor", components = "z"}, {node_set = "end", components = "x", \
-displacement = [0.1, 0.0, 0.0], amount = "pull"}]
+SCENE = (
+    CUBE
+    + BY_GRIP.replace("0.2", "0.1")
+    + """
+[constants]
+kappa = 100.0
+tau_1 = 2.0
 [parameters]
 mu = {unit = "kPa", median = 8.0, log_sd = 0.4}
 relaxation_1 = {range = [0.05, 0.95]}
 """
+)
 TRUTH = {"mu": 9.0, "relaxation_1": 0.6}
 FORCE = "reaction:end:x"
 NOISE = 2e-5  # N
@@ -40,11 +36,8 @@ BOUNDED = ("--bounded", "relaxation_1")
 def folder(tmp_path_factory):
     """A cube's scene file and history, and a posterior from synthetic forces."""
     folder = tmp_path_factory.mktemp("history")
-    mesh = box((1.0, 1.0, 1.0), (1, 1, 1), 1)
-    meshio.write(folder / "cube.vtu", meshio.Mesh(mesh.nodes, [("tetra", mesh.elements)]))
-    with (folder / "history.csv").open("w", newline="") as file:
-        csv.writer(file).writerows([("protocol", "time [s]", "pull"), *ROWS])
-    (folder / "cube.toml").write_text(SCENE)
+    rows = "\n".join(f"{name},{time},{pull}" for name, time, pull in ROWS)
+    write_cube(folder, SCENE, f"protocol,time [s],pull\n{rows}\n")
     words = ["--truth", *(f"{n}={v}" for n, v in TRUTH.items()), "--observe", FORCE]
     words += ["--noise", f"{FORCE}={NOISE}", *BOUNDED, "--draws", "200", "--seed", "1"]
     code = main(["infer", str(folder / "cube.toml"), *words, "--out", str(folder / "run")])

@@ -176,7 +176,7 @@ def test_two_load_states_have_an_ejection_fraction(ventricle_posterior):
     by_hand = float(seen.cavity(forward.at(seen.nodes)(thetas[0])))
     assert volumes["full"][0] == pytest.approx(by_hand)
     text = html_of(Run("left_ventricle"), posterior, CERTIFICATE, fem=False)
-    found = re.search(r"Ejection fraction from full to empty: ([0-9.]+) \(", text)
+    found = re.search(r"smaller in empty than in full by ([0-9.]+) \(", text)
     expected = 100.0 * (1.0 - np.median(volumes["empty"] / volumes["full"]))
     assert float(found[1]) == pytest.approx(expected, abs=0.1)
     assert charts.state_volumes(ventricle_posterior) == {}

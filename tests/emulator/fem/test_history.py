@@ -13,40 +13,19 @@ import emulator as em
 from calibrate.measurements.words import kinds_of
 from emulator.core.errors import InputError
 from emulator.fem.history import HistorySolver, half_steps_error, write_history
-from emulator.geometry.generators.box import box
 from emulator.scenes.file import read_scene
+from history_support import BY_GRIP, CUBE, write_cube
 
 TIMES = np.array([0.25, 0.5, 1.0, 2.0, 6.0])
-PULLED = """
-law = "neo_hookean_split"
-mesh = "cube.vtu"
-history = "history.csv"
-viscosity = {kind = "prony"}
-node_sets = {left = {axis = "x", at = 0.0}, front = {axis = "y", at = 0.0}, floor = {axis = "z", \
-at = 0.0}, end = {axis = "x", at = 1.0}}
-facet_sets = {right = {axis = "x", at = 1.0}}
-constants = {kappa = 100.0}
-[[supports]]
-node_set = "left"
-components = "x"
-[[supports]]
-node_set = "front"
-components = "y"
-[[supports]]
-node_set = "floor"
-components = "z"
+OF_TISSUE = """
+[constants]
+kappa = 100.0
 [parameters]
 mu = {unit = "kPa", median = 8.0, log_sd = 0.7}
 relaxation_1 = {range = [0.01, 0.99]}
 tau_1 = {unit = "s", median = 2.0, log_sd = 1.0}
 """
-BY_GRIP = """
-[[supports]]
-node_set = "end"
-components = "x"
-displacement = [0.2, 0.0, 0.0]
-amount = "pull"
-"""
+PULLED = CUBE + OF_TISSUE
 BY_LOAD = """
 [[loads]]
 kind = "dead_pressure"
@@ -61,11 +40,7 @@ TABLE = "protocol,time [s],pull\n" + "".join(
 
 def written(folder, driven=BY_GRIP, table=TABLE, scene=PULLED):
     """The scene file of a cube that is pulled along x, beside its mesh and its history."""
-    mesh = box((1.0, 1.0, 1.0), (1, 1, 1), 1)
-    meshio.write(folder / "cube.vtu", meshio.Mesh(mesh.nodes, [("tetra", mesh.elements)]))
-    (folder / "history.csv").write_text(table)
-    (folder / "cube.toml").write_text(scene.replace("[[supports]]", f"{driven}[[supports]]", 1))
-    return folder / "cube.toml"
+    return write_cube(folder, scene.replace("[[supports]]", f"{driven}[[supports]]", 1), table)
 
 
 @pytest.fixture(scope="module")
