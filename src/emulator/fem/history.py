@@ -30,7 +30,7 @@ from emulator.core.units import IN_KPA, factor, with_unit
 from emulator.fem.newton import NewtonOptions
 from emulator.fem.simulator import Simulator
 from emulator.fem.solution import Solution, Status
-from emulator.fem.through_time import slopes_through_time, steps_of
+from emulator.fem.through_time import slopes_through_time, system_of
 from emulator.geometry.io import write_solution
 from emulator.mechanics.laws import Law
 from emulator.mechanics.laws.law import Quantity
@@ -41,6 +41,7 @@ from emulator.scenes.scene import Scene
 from emulator.scenes.tissue import Tissue
 from emulator.viscosity.times import TIME, check_times, read_times
 
+_OPTIONS = NewtonOptions.load_steps(1, most=100)  # a step that converges takes a few iterations
 _SAME_TIME = 1e-9  # relative difference of times that are equal
 
 
@@ -181,7 +182,7 @@ class HistorySolver:
 
     scene: BodyInTime
     executor: Executor | str | None = field(default=None, metadata={STAYS: True})
-    options: NewtonOptions = field(default_factory=NewtonOptions)
+    options: NewtonOptions = _OPTIONS
 
     sent_once = True
 
@@ -193,7 +194,7 @@ class HistorySolver:
     @property
     def stepwise(self) -> bool:
         """Whether a factor is kept between solves, as on a large mesh."""
-        return steps_of(self.scene.scene, self.options)[0].kept is not None
+        return system_of(self.scene.scene).kept is not None
 
     @cached_property
     def steps(self) -> Simulator:
@@ -230,9 +231,7 @@ class HistorySolver:
         directions = jax.jacfwd(body.thetas)(theta)[0].T  # the same at every row
         slopes, thetas = jnp.zeros((len(directions), *rows.shape)), body.thetas(theta)
         for test in body.tests.values():
-            of_test = slopes_through_time(
-                body.scene, self.options, rows[test], thetas[test], directions
-            )
+            of_test = slopes_through_time(body.scene, rows[test], thetas[test], directions)
             slopes = slopes.at[:, test].set(of_test)
         if not np.isfinite(slopes).all():
             raise SolverError(f"a step of '{body.name}' has no derivatives: singular tangent")

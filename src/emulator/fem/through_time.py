@@ -227,10 +227,15 @@ class StepScene(Scene):
 
 
 @kept
-def steps_of(scene: Scene, options: NewtonOptions) -> tuple[System, SolutionMap]:
-    """Return the equations of a step of ``scene``, and what solves them, compiled once."""
-    system = System(StepScene.of(scene))
-    return system, differentiable(system, options)
+def system_of(scene: Scene) -> System:
+    """Return the equations of a step of ``scene``, which keep what they compile."""
+    return System(StepScene.of(scene))
+
+
+@kept
+def _solver_of(scene: Scene, options: NewtonOptions) -> SolutionMap:
+    """Return what solves a step of ``scene``."""
+    return differentiable(system_of(scene), options)
 
 
 class Past(NamedTuple):
@@ -336,7 +341,7 @@ def through_time(scene: Scene, options: NewtonOptions, thetas: jax.Array) -> Sol
     """
     require_float64("FEM")
     times = thetas[:, scene.parameter_names.index(TIME)]
-    system, equilibrium = steps_of(scene, options)
+    system, equilibrium = system_of(scene), _solver_of(scene, options)
     if not is_traced(times):
         _check(scene, np.asarray(times))
 
@@ -362,7 +367,7 @@ def through_time(scene: Scene, options: NewtonOptions, thetas: jax.Array) -> Sol
 
 
 def slopes_through_time(
-    scene: Scene, options: NewtonOptions, u: jax.Array, thetas: jax.Array, directions: jax.Array
+    scene: Scene, u: jax.Array, thetas: jax.Array, directions: jax.Array
 ) -> jax.Array:
     """Return the derivatives (k, m, n, 3) of equilibria along directions that all times share.
 
@@ -375,8 +380,7 @@ def slopes_through_time(
     thetas : theta at each time, (m, p).
     directions : the directions in theta, (k, p).
     """
-    system, _ = steps_of(scene, options)
-    past = _at_rest(scene)
+    system, past = system_of(scene), _at_rest(scene)
     along = jax.tree.map(lambda field: jnp.zeros((len(directions), *field.shape)), past)
     intervals = jnp.diff(thetas[:, scene.parameter_names.index(TIME)], prepend=0.0)
     slopes = list[jax.Array]()
@@ -446,7 +450,7 @@ def force_through_time(scene: Scene, force: SupportForce) -> ForceThroughTime:
         )
     if sprung:
         return lambda u, thetas: force(u[:, force.nodes], thetas)
-    system, _ = steps_of(scene, NewtonOptions())
+    system = system_of(scene)
     of_step = SupportForce(system.scene, force.name, force.direction, springs=False)
 
     def forces(u: jax.Array, thetas: jax.Array) -> jax.Array:
