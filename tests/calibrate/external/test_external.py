@@ -158,7 +158,7 @@ def test_observations_of_outputs_are_named_as_in_the_file(tmp_path):
     assert observe.parts["profile@a"].shape == (2,)
     assert observations_from_json(scene, observe.to_json()).shapes == observe.shapes
     assert list(kinds_of(scene)) == ["extension", "profile"]
-    with pytest.raises(em.InputError, match="outputs of 'bar' are extension, profile"):
+    with pytest.raises(em.InputError, match="of 'bar' there are extension, profile"):
         parse_observation(scene, "nodes:3")
 
 
