@@ -15,9 +15,7 @@ from scipy.stats import rankdata
 from calibrate.analysis.identifiability import stress_band
 from calibrate.figures import BLUE, COLOURS, VERMILION, with_unit
 from calibrate.measurements import Observation
-from calibrate.measurements.in_time import AtEveryRow
 from calibrate.measurements.klotz import klotz_of
-from calibrate.measurements.specimens import SpecimenCurves
 from calibrate.measurements.volume import PressureVolume, in_mmhg, pressure_volume
 from calibrate.measurements.words import to_json
 from calibrate.posterior import Posterior
@@ -71,7 +69,7 @@ def against_data(posterior: Posterior) -> Iterator[tuple[str, go.Figure]]:
         values = np.asarray(tree["posterior_predictive"][name])
         values = values.reshape(values.shape[0] * values.shape[1], -1)
         data = np.ravel(np.asarray(posterior.data[name]))
-        if isinstance(part, SpecimenCurves | AtEveryRow):
+        if hasattr(part, "curves"):
             curves = part.curves(posterior.model.observe.entries.get(name))
             yield name, _curves(part, curves, values, data)
             continue
@@ -115,7 +113,7 @@ def _many_numbers(name: str, part: Observation, values: np.ndarray, data: np.nda
 
 
 def _curves(
-    part: SpecimenCurves | AtEveryRow,
+    part: Any,
     curves: Mapping[str, tuple[np.ndarray, np.ndarray]],
     values: np.ndarray,
     data: np.ndarray,
