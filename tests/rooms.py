@@ -31,6 +31,7 @@ ROOMS = {
     "viscosity": (
         "emulator.viscosity",
         "emulator.fem.through_time",
+        "emulator.fem.after_time",
         "emulator.fem.history",
         "calibrate.measurements.in_time",
         "calibrate.statistical_model.finer_history",

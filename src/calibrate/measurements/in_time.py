@@ -15,8 +15,8 @@ from calibrate.measurements.observation import Observation, derive
 from calibrate.measurements.reaction import Reaction
 from calibrate.measurements.volume import CavityVolume
 from emulator.core.units import IN_MN
+from emulator.fem.after_time import ForceThroughTime, force_through_time
 from emulator.fem.history import BodyInTime
-from emulator.fem.through_time import ForceThroughTime, force_through_time
 
 
 @dataclass(frozen=True, eq=False)

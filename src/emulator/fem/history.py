@@ -27,10 +27,11 @@ from emulator.core.cells import PROTOCOL, Cells, read_cells
 from emulator.core.engine import STAYS, Engine, engine_of
 from emulator.core.errors import InputError, SolverError
 from emulator.core.units import IN_KPA, factor, with_unit
+from emulator.fem.after_time import slopes_through_time
 from emulator.fem.newton import NewtonOptions
 from emulator.fem.simulator import Simulator
 from emulator.fem.solution import Solution, Status
-from emulator.fem.through_time import slopes_through_time, system_of
+from emulator.fem.through_time import system_of
 from emulator.geometry.io import write_solution
 from emulator.mechanics.laws import Law
 from emulator.mechanics.laws.law import Quantity
@@ -193,7 +194,7 @@ class HistorySolver:
 
     @property
     def stepwise(self) -> bool:
-        """Whether a factor is kept between solves, as on a large mesh."""
+        """A factor is kept between solves on a large mesh."""
         return system_of(self.scene.scene).kept is not None
 
     @cached_property
@@ -343,4 +344,7 @@ def _range(values: np.ndarray) -> tuple[float, float]:
 def _tests(cells: Cells) -> dict[str, np.ndarray]:
     """Return the rows (k,) of each test, from 0, by its name."""
     names = [row.get(PROTOCOL, "") for row in cells.rows.values()]
+    if PROTOCOL in cells.words and "" in names:
+        row = list(cells.rows)[names.index("")]
+        raise InputError(f"row {row}, column '{PROTOCOL}' is empty; name the row's test")
     return {name: np.flatnonzero([n == name for n in names]) for name in dict.fromkeys(names)}

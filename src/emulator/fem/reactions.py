@@ -134,7 +134,7 @@ class SupportForce:
 
     @property
     def acts_by(self) -> tuple[bool, bool]:
-        """Whether the support acts by prescribed displacements, and by springs."""
+        """Say whether the support acts by prescribed displacements, and whether by springs."""
         prescribed, sprung = self._virtual
         return bool(prescribed.any()), bool(sprung.any())
 

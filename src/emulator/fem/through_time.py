@@ -24,7 +24,7 @@ shared. Errors are of second order in the length of a step, and none of one in w
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property, partial
 from typing import Any, NamedTuple, cast
@@ -40,10 +40,9 @@ from emulator.core.kept import kept
 from emulator.core.machine import require_float64
 from emulator.fem.assembly import System
 from emulator.fem.compiled import compiled, is_traced, scan
-from emulator.fem.derivatives import SolutionMap, derivatives_along, differentiable
+from emulator.fem.derivatives import SolutionMap, differentiable
 from emulator.fem.energy import at_points, law_gradients, parameters_at
 from emulator.fem.newton import NewtonOptions
-from emulator.fem.reactions import SupportForce
 from emulator.fem.solution import Solution, Status
 from emulator.geometry.discretisation import Discretisation, shapes_at
 from emulator.geometry.mesh import Mesh
@@ -73,8 +72,6 @@ from emulator.viscosity.overstress import (
 from emulator.viscosity.series import KELVIN_VOIGT
 from emulator.viscosity.times import TIME, check_times
 
-ForceThroughTime = Callable[[jax.Array, jax.Array], jax.Array]
-"""The forces (m,) in mN of displacements (m, n, 3) mm and thetas (m, p), from rest on."""
 _ROWS = 4  # of a point's tissue: the stress A, and (s, d, 0)
 _MASS, _DASHPOTS = "mass of the step", "dashpots of the step"  # names of anchors among the values
 
@@ -251,7 +248,8 @@ class Past(NamedTuple):
     strains: jax.Array | None
 
 
-def _at_rest(scene: Scene) -> Past:
+def at_rest(scene: Scene) -> Past:
+    """Return the past of a body at rest at time 0."""
     shape, memory, strains = scene.blocks.weights.shape, None, None
     if scene.viscosity is not None and scene.viscosity.kind == KELVIN_VOIGT:
         strains = jnp.zeros((2, *shape, 3, 3))
@@ -262,7 +260,7 @@ def _at_rest(scene: Scene) -> Past:
 
 
 @compiled
-def _before_step(system: System, past: Past, theta: jax.Array, interval: jax.Array) -> jax.Array:
+def before_step(system: System, past: Past, theta: jax.Array, interval: jax.Array) -> jax.Array:
     """Return theta and, after it, what is known of a step of ``interval`` s."""
     scene, motion = cast(StepScene, system.scene), past.motion
     points = mass = dashpots = None
@@ -297,7 +295,7 @@ def _known_of_points(
 
 
 @compiled
-def _after_step(
+def after_step(
     system: System, past: Past, u: jax.Array, theta: jax.Array, interval: jax.Array
 ) -> Past:
     """Return the past after a step of ``interval`` s to ``u`` (n, 3) mm."""
@@ -353,118 +351,17 @@ def through_time(scene: Scene, options: NewtonOptions, thetas: jax.Array) -> Sol
         # A body at rest starts from there: supports that jump alone would invert elements.
         ahead = scene.on_supports(u + interval * velocity, theta)
         start = jnp.where(jnp.any(u != 0.0), ahead, 0.0)
-        whole = _before_step(system, past, theta, interval)
+        whole = before_step(system, past, theta, interval)
         solution = equilibrium(whole, jax.lax.stop_gradient(start))
         failed = status != Status.CONVERGED
         solution = solution._replace(status=jnp.where(failed, status, solution.status))
-        past = _after_step(system, past, solution.displacement, whole, interval)
+        past = after_step(system, past, solution.displacement, whole, interval)
         return (past, solution.status), solution
 
     intervals = jnp.diff(times, prepend=0.0)
-    first = _at_rest(scene), jnp.asarray(int(Status.CONVERGED))
+    first = at_rest(scene), jnp.asarray(int(Status.CONVERGED))
     solutions: Solution = scan(step, first, (thetas, intervals))[1]
     return solutions
-
-
-def slopes_through_time(
-    scene: Scene, u: jax.Array, thetas: jax.Array, directions: jax.Array
-) -> jax.Array:
-    """Return the derivatives (k, m, n, 3) of equilibria along directions that all times share.
-
-    Step by step, by one tangent for all directions. For numbers; under ``jit`` differentiate
-    :func:`through_time`.
-
-    Parameters
-    ----------
-    u : the equilibria, (m, n, 3) mm.
-    thetas : theta at each time, (m, p).
-    directions : the directions in theta, (k, p).
-    """
-    system, past = system_of(scene), _at_rest(scene)
-    along = jax.tree.map(lambda field: jnp.zeros((len(directions), *field.shape)), past)
-    intervals = jnp.diff(thetas[:, scene.parameter_names.index(TIME)], prepend=0.0)
-    slopes = list[jax.Array]()
-    for row, theta, interval in zip(u, thetas, intervals, strict=True):
-        whole, change = _before_step_along(system, past, theta, interval, along, directions)
-        tangent = system.safe_tangent(row, whole)[0]
-        slopes.append(derivatives_along(system, tangent, row, whole, change))
-        past, along = _after_step_along(
-            system, past, row, whole, interval, along, slopes[-1], change
-        )
-    return jnp.stack(slopes, axis=1)
-
-
-@compiled
-def _before_step_along(
-    system: System,
-    past: Past,
-    theta: jax.Array,
-    interval: jax.Array,
-    along: Past,
-    directions: jax.Array,
-) -> tuple[jax.Array, jax.Array]:
-    """Return :func:`_before_step`, and its derivatives along (k, ...) the past's and theta's."""
-
-    def before(past: Past, theta: jax.Array) -> jax.Array:
-        return _before_step(system, past, theta, interval)
-
-    derivative = jax.vmap(lambda *change: jax.jvp(before, (past, theta), change)[1])
-    return before(past, theta), derivative(along, directions)
-
-
-@compiled
-def _after_step_along(
-    system: System,
-    past: Past,
-    u: jax.Array,
-    theta: jax.Array,
-    interval: jax.Array,
-    along: Past,
-    du: jax.Array,
-    dtheta: jax.Array,
-) -> tuple[Past, Past]:
-    """Return :func:`_after_step`, and its derivatives along those of its arguments, (k, ...)."""
-
-    def after(past: Past, u: jax.Array, theta: jax.Array) -> Past:
-        return _after_step(system, past, u, theta, interval)
-
-    derivative = jax.vmap(lambda *change: jax.jvp(after, (past, u, theta), change)[1])
-    return after(past, u, theta), derivative(along, du, dtheta)
-
-
-def force_through_time(scene: Scene, force: SupportForce) -> ForceThroughTime:
-    """Return the force in mN of a support of a body in time, as a function of where it has been.
-
-    What holds the body balances what the step's tissue, mass and loads do there; the force of
-    springs does not depend on the past.
-
-    force : the force of the support on the body at rest.
-
-    :class:`InputError` for a support by springs at some displacements and held at others.
-    """
-    held, sprung = force.acts_by
-    if held and sprung:
-        raise InputError(
-            f"force of support '{force.name}': a part of it is held and a part is on springs; in "
-            "time give a direction or a set of one of them"
-        )
-    if sprung:
-        return lambda u, thetas: force(u[:, force.nodes], thetas)
-    system = system_of(scene)
-    of_step = SupportForce(system.scene, force.name, force.direction, springs=False)
-
-    def forces(u: jax.Array, thetas: jax.Array) -> jax.Array:
-        def step(past: Past, row: tuple[jax.Array, ...]) -> tuple[Past, jax.Array]:
-            displacement, theta, interval = row
-            whole = _before_step(system, past, theta, interval)
-            value = of_step(displacement[of_step.nodes], whole)
-            return _after_step(system, past, displacement, whole, interval), value
-
-        times = thetas[:, scene.parameter_names.index(TIME)]
-        rows = (u, thetas, jnp.diff(times, prepend=0.0))
-        return jax.lax.scan(step, _at_rest(scene), rows)[1]
-
-    return forces
 
 
 def _check(scene: Scene, times: np.ndarray) -> None:

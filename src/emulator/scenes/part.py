@@ -294,7 +294,7 @@ class BoundaryCondition(Part):
     """A part that prescribes displacements, or resists them or their rates."""
 
     resists_velocity: ClassVar[bool] = False
-    """Whether the part resists how fast the body moves, and the scene goes through time."""
+    """Whether the part resists how fast the body moves; its scene then goes through time."""
 
     def held(self, mesh: Mesh) -> Held | None:
         """Return prescribed displacements, or None."""

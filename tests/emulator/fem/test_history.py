@@ -169,6 +169,7 @@ def test_a_history_is_written_for_players(pulled, solver, tmp_path):
         ("slow,2,", "slow,0.3,", "time goes back from 1 to 0.3 s"),
         ("slow,2,1", "slow,2,", "row 4, column 'pull' is empty"),
         ("slow,2,1", "slow,2,far", "row 4, column 'pull' is 'far', not a number"),
+        ("slow,2,", ",2,", "row 4, column 'protocol' is empty"),
         ("slow,0.25", "slow,-0.25", "row 1: time is -0.25 s"),
         (",pull", ",pulls", "needs 'pull'"),
     ],

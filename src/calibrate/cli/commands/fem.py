@@ -113,7 +113,7 @@ def _run_history(problem: Any, theta: jax.Array, out: str | None) -> Answer:
     lines = [table(list(columns), list(zip(*columns.values(), strict=True)))]
     lines.append(
         f"steps half as long move a node by {error:.2g} mm at most, "
-        f"{100.0 * error / largest.max():.2g} % of the largest displacement"
+        f"{100.0 * error / max(largest.max(), 1e-300):.2g} % of the largest displacement"
     )
     if out:
         lines.append(f"shapes of all rows: {write_history(out, problem, u)}")
