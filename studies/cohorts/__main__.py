@@ -2,6 +2,7 @@
 
     python -m studies.cohorts --data DIR [--engine WORDS]    # DIR as ../shared/measured
     python -m studies.cohorts --data DIR --quick
+    python -m studies.cohorts --data DIR --keep FOLDER       # goes on where it was stopped
 
 Each subject is a table of its tests, calibrated and certified by itself; those that do not fail
 make a population. Writes results.json after each cohort, and cohorts.png.
@@ -27,19 +28,18 @@ OF_ALL = ("median[", "sd[", "correlation[")  # beginnings of names of what all s
 COLOURS = (BLUE, ORANGE, GREEN)
 
 
-def cohort(pieces: Iterator[Piece], law: str, engine: str) -> Case:
+def cohort(pieces: Iterator[Piece], law: str, engine: str, folder: Path) -> Case:
     """The posterior and verdict of each subject, and of the population."""
-    with tempfile.TemporaryDirectory() as place:
-        folder, rows = Path(place), [["subject", "data", "group"]]
-        for piece in pieces:
-            piece.write(folder / f"{piece.name}.csv", np.ones(len(piece.rows), bool))
-            rows.append([piece.name, f"{piece.name}.csv", piece.name[:GROUP_LETTERS]])
-        with (folder / "subjects.csv").open("w", newline="") as file:
-            csv.writer(file).writerows(rows)
-        begin = perf_counter()
-        words = ("--law", law, "--engine", engine, "--seed", SEED, "--out", "cohort")
-        told = calibrate(folder, "cohort", "subjects.csv", *words)
-        seconds = perf_counter() - begin
+    rows = [["subject", "data", "group"]]
+    for piece in pieces:
+        piece.write(folder / f"{piece.name}.csv", np.ones(len(piece.rows), bool))
+        rows.append([piece.name, f"{piece.name}.csv", piece.name[:GROUP_LETTERS]])
+    with (folder / "subjects.csv").open("w", newline="") as file:
+        csv.writer(file).writerows(rows)
+    begin, whole = perf_counter(), not (folder / "cohort").exists()
+    words = ("--law", law, "--engine", engine, "--seed", SEED, "--out", "cohort")
+    told = calibrate(folder, "cohort", "subjects.csv", *words)
+    seconds = perf_counter() - begin
     groups = {name: group for name, _, group in rows[1:]}
     return {
         "law": law,
@@ -50,7 +50,7 @@ def cohort(pieces: Iterator[Piece], law: str, engine: str) -> Case:
         "failed": told["failed"],
         "population": {n: row for n, row in told["population"].items() if n.startswith(OF_ALL)},
         "members": told["members"],
-        "seconds": round(seconds, 1),
+        "seconds" if whole else "seconds_of_the_rest": round(seconds, 1),
     }
 
 
@@ -80,6 +80,7 @@ def main() -> None:
     words = parser(__doc__, HERE)
     words.add_argument("--data", type=Path, required=True, help="folder of the measurements")
     words.add_argument("--engine", default="processes:2")
+    words.add_argument("--keep", type=Path, help="folder of the cohorts, which go on there")
     arguments = words.parse_args()
     results = Results(arguments.out, SEED, again=arguments.again)
     data, quick = arguments.data, arguments.quick
@@ -87,8 +88,13 @@ def main() -> None:
         "clots": (lambda: clots(data, A_FEW_CLOTS if quick else CLOTS), "ogden_1"),
         "sheep hearts": (lambda: sheep(data, HEARTS), "holzapfel_ogden_orthotropic"),
     }
-    for name, (pieces, law) in list(every.items())[: 1 if quick else None]:
-        results.case(name, lambda pieces=pieces, law=law: cohort(pieces(), law, arguments.engine))
+    with tempfile.TemporaryDirectory() as place:
+        for name, (pieces, law) in list(every.items())[: 1 if quick else None]:
+            folder = (arguments.keep or Path(place)).resolve() / name.replace(" ", "_")
+            folder.mkdir(parents=True, exist_ok=True)
+            results.case(
+                name, lambda p=pieces, law=law, at=folder: cohort(p(), law, arguments.engine, at)
+            )
     results.write()
     draw(results.cases, arguments.out / "cohorts.png")
 

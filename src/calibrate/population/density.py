@@ -1,35 +1,35 @@
-r"""The log density of a population and its members on real coordinates.
+r"""The posterior of a population, its members integrated out.
 
-NumPyro maps the population and own unknowns to the real line, as of any model; the members' scores
-are replaced by coordinates in which the members are about independent of the population, with their
-Jacobian.
+Members are sampled alone first, each under the prior :math:`\pi_i` of its model. From its draws,
+the likelihood of a member is a mixture of normals on the parameters' scales
+(:mod:`calibrate.population.mixtures`), around a point :math:`b_i`,
 
-Given the population, :math:`x_i = x(q_i)` with scores :math:`q_i = L z_i`. A member without
-informative data wants :math:`z_i` as its coordinates, one whose data fixes :math:`x_i` wants
-:math:`x_i`: in the others the posterior is a funnel, or a thin sheet. Take the member's log
-likelihood for quadratic around a value :math:`\bar x_i`, with slope :math:`g_i` and precision
-:math:`\Lambda_i`, and :math:`x(q)` for linear around the score :math:`\bar q_i` of
-:math:`\bar x_i`, with slopes :math:`D = \text{diag}(dx_k/dq_k)`. Then :math:`z_i` given the
-population is Gaussian, and in
+.. math:: \ell_i(x) = \sum_j e^{c_{ij} + h_{ij}^T t - t^T \Lambda_{ij} t / 2}, \qquad t = x - b_i .
 
-.. math:: z_i = P^{-1} L^T D\,(g_i + \Lambda_i D \bar q_i) + C^{-T} e_i, \qquad
-          P = I + L^T D \Lambda_i D L = C C^T
+Under a population of means m and covariance :math:`M M^T`, :math:`M = \text{diag}(s) L`, its
+integral has a closed form. With the slope :math:`g = h - \Lambda (m - b)` at the mean,
 
-:math:`e_i` is standard normal and independent of the population. The change of variables has the
-determinant :math:`\prod_k C_{kk}^{-1}` and is exact for *any* :math:`\bar x_i`, :math:`g_i` and
-:math:`\Lambda_i`; good ones make the posterior round. They come from the member's own posterior, by
-dividing by its prior (both as Gaussians),
+.. math::
+    \int \ell(x)\, N(x; m, M M^T)\, dx = \sum_j e^{v_j} |A_j|^{-1/2}
+    e^{g^T M A^{-1} M^T g / 2}, \qquad A = I + M^T \Lambda M,
 
-.. math:: \Lambda_i = A^{-1} - B^{-1}, \qquad g_i = B^{-1} (\bar x_i - \bar b_i)
+where v is the exponent at m. So the population has a density of its own, smooth for any sd, with no
+member to move, on which NUTS is fast. Each member also divides by the mass of the population within
+the ranges, :math:`\prod_k [\Phi(b_k) - \Phi(a_k)]`, as if parameters were independent there.
 
-with mean and covariance :math:`\bar x_i, A` of its draws and :math:`\bar b_i, B` of its prior's, in
-the directions in which that is positive; elsewhere 0. A member without data has
-:math:`e_i = z_i`. (Partial non-centring: Papaspiliopoulos, Roberts and Sköld 2007.)
+Both are approximations, and the draws know better: with :math:`x_{ij}` as draws of member i,
+
+.. math:: p(y_i \mid m, s, R) \propto \frac 1S \sum_j w_{ij}, \qquad
+          w_{ij} = \frac{p(x_{ij} \mid m, s, R)}{\pi_i(x_{ij})}
+
+with the exact density of :mod:`calibrate.population.model` (Lunn, Barrett, Sweeting and Thompson
+2013 sample members so). The ratio of both weighs the population's draws. A member of a draw of the
+population is one of its draws, in proportion to :math:`w_{ij}`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -37,152 +37,137 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jax.scipy.special import ndtr
 from numpyro import handlers
 from numpyro.distributions.transforms import biject_to
 from numpyro.infer.util import potential_energy
 
-from calibrate.population.model import (
-    CHOLESKY,
-    MEDIAN,
-    SCORES,
-    SD,
-    PopulationModel,
-    ends,
-    to_scale,
-    to_score,
-)
-from calibrate.statistical_model import Data
-from calibrate.statistical_model.density import Target, threads_for
+from calibrate.population.mixtures import Mixtures
+from calibrate.population.model import CHOLESKY, MEDIAN, SD, PopulationDraws, PopulationModel
+from calibrate.statistical_model.density import Target
 from emulator.core.kept import kept
+from emulator.core.machine import cores
 from emulator.core.small_matrices import eliminate
 
 
-class Information(NamedTuple):
-    """The information of each member's data on its shared unknowns, on their scales.
+class Alone(NamedTuple):
+    """Draws of the members alone.
 
-    value : the point (n, k) at which the log likelihood is expanded.
-    slope, precision : its slope (n, k) there, and minus its Hessian (n, k, k).
+    x : the shared unknowns (n, S, k) on their parameters' scales.
+    log_prior : the log density (n, S) of each under its model's prior.
     """
 
-    value: jax.Array
-    slope: jax.Array
-    precision: jax.Array
+    x: Any
+    log_prior: Any
 
 
-def information_of(draws: np.ndarray, prior: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return value (k,), slope (k,) and precision (k, k) from draws (s, k), and the prior's."""
-    root = np.linalg.cholesky(np.atleast_2d(np.cov(prior.T)))
-    whitened = np.linalg.solve(root, (draws - prior.mean(axis=0)).T)
-    sizes, axes = np.linalg.eigh(np.atleast_2d(np.cov(whitened)))
-    # Directions in which draws happen to spread more than the prior are left out.
-    precision = np.maximum(1.0 / np.maximum(sizes, 1e-12) - 1.0, 0.0)
-    shift = np.where(precision > 0.0, axes.T @ whitened.mean(axis=1), 0.0)
-    back = np.linalg.solve(root.T, axes)
-    return draws.mean(axis=0), back @ shift, (back * precision) @ back.T
+class Weighed(NamedTuple):
+    """The draws of the members at draws of the population.
 
-
-def scores_of(
-    e: jax.Array, information: Information, cut: Sequence[jax.Array], factor: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Return scores z (n, k) at coordinates ``e`` (n, k), and the log determinant of dz/de, ().
-
-    cut : mean and sd of the population before the cut, and both ends of the range, (k,) each, on
-        the parameters' scales.
-    factor : the lower factor L (k, k) of the correlation of the scores.
+    log_weight : (s,) of the population's draws, by the exact density over the mixtures'.
+    member_draws : (s, n) the draw that each member has.
+    in_use : (n,) the number of each member's draws that they rest on.
     """
 
-    def of_member(e: jax.Array, information: Information) -> tuple[jax.Array, jax.Array]:
-        score, slope = to_score(information.value, *cut)
-        root = slope[:, None] * factor
-        P = jnp.eye(len(e)) + root.T @ information.precision @ root
-        gradient = information.slope + information.precision @ (slope * score)
-        # P = L diag(pivots) L^T, so that C = L diag(sqrt(pivots)).
-        pivots, inverse_L = eliminate(P, jnp.eye(len(e)))
-        inverse_C = inverse_L / jnp.sqrt(pivots)[:, None]
-        z = inverse_C.T @ (inverse_C @ (root.T @ gradient) + e)
-        return z, -0.5 * jnp.sum(jnp.log(pivots))
-
-    z, log_determinants = jax.vmap(of_member)(e, information)
-    return z, jnp.sum(log_determinants)
-
-
-class Conditions(NamedTuple):
-    """The inputs of the posterior of a population.
-
-    data : data by member and observation; members without data are missing.
-    information : the information from which the coordinates are made; it does not change the
-        posterior.
-    """
-
-    data: Mapping[str, Data]
-    information: Information
-
-
-class PopulationDraws(NamedTuple):
-    """Median and sd (k,) of a population, and the lower factor L (k, k) of its correlation."""
-
-    median: jax.Array
-    sd: jax.Array
-    factor: jax.Array
+    log_weight: np.ndarray
+    member_draws: np.ndarray
+    in_use: np.ndarray
 
 
 @dataclass(frozen=True)
 class PopulationDensity(Target):
-    """The posterior of a population.
+    """The posterior of a population from :class:`~calibrate.population.mixtures.Mixtures`.
 
-    constrain : (z (s, p), information) -> population, scores (s, n, k), own unknowns by site (s,).
-    values : (*population (s, ...), scores (s, ..., k)) -> shared unknowns by name (s, ...).
+    constrain : z (s, p) -> population (s, ...).
+    values : (population (s, ...), scores (s, ..., k)) -> shared unknowns by name (s, ...).
+    weigh : (rng_key, z (s, p), mixtures, :class:`Alone`) -> :class:`Weighed`.
     """
 
-    constrain: Callable[[jax.Array, Information], tuple[PopulationDraws, jax.Array, dict[str, Any]]]
+    constrain: Callable[[jax.Array], PopulationDraws]
     values: Callable[..., dict[str, jax.Array]]
+    weigh: Callable[[jax.Array, np.ndarray, Mixtures, Alone], Weighed]
 
 
 @kept
 def density_of_population(model: PopulationModel) -> PopulationDensity:
-    """Return the density of the posterior of population and members, up to a constant."""
-    sites = handlers.trace(handlers.seed(model, jax.random.key(0))).get_trace()
-    sampled = {name: site for name, site in sites.items() if site["type"] == "sample"}
-    transforms = {name: biject_to(site["fn"].support) for name, site in sampled.items()}
-    example = {name: transforms[name].inv(site["value"]) for name, site in sampled.items()}
+    """Return the density of the posterior of a population, up to a constant."""
+    transforms = {name: biject_to(prior.support) for name, prior in model.sampled_priors.items()}
+    draw = handlers.trace(handlers.seed(model, jax.random.key(0))).get_trace()
+    example = {name: transforms[name].inv(site["value"]) for name, site in draw.items()}
     flat, unravel = ravel_pytree(example)
 
-    def population_at(values: Mapping[str, jax.Array]) -> PopulationDraws:
+    def population_at(z: jax.Array) -> PopulationDraws:
+        values = {name: transforms[name](value) for name, value in unravel(z).items()}
         medians, sds = (
-            jnp.stack([transforms[f"{role}[{k}]"](values[f"{role}[{k}]"]) for k in model.shared])
-            for role in (MEDIAN, SD)
+            jnp.stack([values[f"{role}[{k}]"] for k in model.shared]) for role in (MEDIAN, SD)
         )
-        single = CHOLESKY not in values
-        factor = jnp.eye(1) if single else transforms[CHOLESKY](values[CHOLESKY])
-        return PopulationDraws(medians, sds, factor)
+        return PopulationDraws(medians, sds, values.get(CHOLESKY, jnp.eye(len(model.shared))))
 
-    def with_scores(z: jax.Array, information: Information) -> Any:
-        values = unravel(z)
-        population = population_at(values)
-        mean = [to_scale(p, population.median[k]) for k, p in enumerate(model.shared.values())]
-        low, high = jnp.array([ends(parameter) for parameter in model.shared.values()]).T
-        cut = jnp.stack(mean), population.sd, low, high
-        scores, log_determinant = scores_of(values[SCORES], information, cut, population.factor)
-        return {**values, SCORES: scores}, population, log_determinant
+    def log_density(z: jax.Array, mixtures: Mixtures) -> jax.Array:
+        log_prior = -potential_energy(model, (), {}, unravel(z))
+        return log_prior + jnp.sum(log_likelihoods(model, population_at(z), mixtures))
 
-    def log_density(z: jax.Array, conditions: Conditions) -> jax.Array:
-        values, _, log_determinant = with_scores(z, conditions.information)
-        return log_determinant - potential_energy(model, (conditions.data,), {}, values)
+    @jax.jit
+    def at_draws(
+        keys: jax.Array, z: jax.Array, mixtures: Mixtures, alone: Alone
+    ) -> tuple[jax.Array, ...]:
+        def at(key_and_z: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            key, z = key_and_z
+            population = population_at(z)
+            log_weights = model.log_density(alone.x, population) - alone.log_prior
+            exact = jax.nn.logsumexp(log_weights, axis=1)
+            ratio = exact - log_likelihoods(model, population, mixtures)
+            shares = jnp.cumsum(jnp.exp(log_weights - exact[:, None]), axis=1)
+            at = jax.random.uniform(key, (len(shares),)) * shares[:, -1]
+            return jnp.sum(ratio), jnp.sum(shares < at[:, None], axis=1)
 
-    def constrain(z: jax.Array, information: Information) -> Any:
-        values, population, _ = with_scores(z, information)
-        member_values = {
-            f"{name}[{member}]": transforms[f"{name}[{member}]"](values[f"{name}[{member}]"])
-            for member, names in model.unshared.items()
-            for name in names
-        }
-        return population, values[SCORES], member_values
+        return jax.lax.map(at, (keys, z))
+
+    def weigh(key: jax.Array, z: np.ndarray, mixtures: Mixtures, alone: Alone) -> Weighed:
+        log_weight, chosen = map(
+            np.asarray, at_draws(jax.random.split(key, len(z)), jnp.asarray(z), mixtures, alone)
+        )
+        return Weighed(log_weight, chosen, np.array([_in_use(column) for column in chosen.T]))
 
     return PopulationDensity(
         log_density,
         dimension=int(np.size(flat)),
-        piloted=False,  # a transport map has too many monomials; members are straight already
-        at_once=min(threads_for(member.forward) for member in model.members.values()),
-        constrain=jax.jit(jax.vmap(constrain, in_axes=(0, None))),
+        piloted=False,
+        at_once=cores(),
+        constrain=jax.jit(jax.vmap(population_at)),
         values=jax.jit(jax.vmap(model.shared_values)),
+        weigh=weigh,
     )
+
+
+def log_likelihoods(
+    model: PopulationModel, population: PopulationDraws, mixtures: Mixtures
+) -> jax.Array:
+    """Return the log likelihood (n,) of one population, from each member's mixture."""
+    mean, ends = model.means(population.median), model.ends
+    M = population.sd[:, None] * population.factor
+
+    def of_part(
+        centre: jax.Array, constant: jax.Array, slope: jax.Array, precision: jax.Array
+    ) -> jax.Array:
+        t = mean - centre
+        g = slope - precision @ t
+        value = constant + 0.5 * (slope + g) @ t
+        pivots, rows = eliminate(jnp.eye(len(t)) + M.T @ precision @ M, (M.T @ g)[:, None])
+        return value + 0.5 * jnp.sum(rows[:, 0] ** 2 / pivots - jnp.log(pivots))
+
+    of_member = jax.vmap(of_part, in_axes=(None, 0, 0, 0))
+    by_part = jax.vmap(of_member)(*mixtures)
+    low, high = ((end - mean) / population.sd for end in ends)
+    return jax.nn.logsumexp(by_part, axis=1) - jnp.sum(jnp.log(ndtr(high) - ndtr(low)))
+
+
+def _in_use(chosen: np.ndarray) -> float:
+    r"""Return the effective number of different draws among ``chosen`` (s,).
+
+    Two at random are the same with the probability :math:`\sum_j \bar w_j^2`, one over it.
+    """
+    counts = np.bincount(chosen)
+    same = float(np.sum(counts * (counts - 1.0)))
+    pairs = len(chosen) * (len(chosen) - 1.0)
+    return pairs / same if same > 0.0 else pairs

@@ -3,15 +3,16 @@ r"""The statistical model of a population and its members.
 Each member i is a :class:`~calibrate.statistical_model.Model` with its own body, loads, noise and
 data. Some unknowns of theta, the shared ones, differ from member to member as the population does.
 On the scale of the scene's parameter (:math:`x = \ln\theta` where it is logarithmic, else
-:math:`x = \theta`), with the parameter's range l ... h there and :math:`w = h - l`,
+:math:`x = \theta`), with the parameter's range l ... h there, and the prior :math:`\pi_k` that the
+first member's model has of it,
 
 .. math::
     q_i = L z_i, \quad z_i \sim N(0, I), \qquad L L^T = R \sim \text{LKJ}(\eta), \qquad
     x_{ik} = F_k^{-1}(\Phi(q_{ik})), \\
-    m_k \sim N\big(\tfrac12 (l_k + h_k), (\tfrac12 w_k)^2\big) \text{ on } (l_k, h_k), \qquad
-    s_k \sim \text{HalfNormal}(\tfrac14 w_k)
+    m_k \sim \pi_k, \qquad s_k \sim \text{HalfNormal}\big(\tfrac12 \text{sd}(\pi_k)\big)
 
-where :math:`F_k` is the normal distribution function of mean :math:`m_k` and sd :math:`s_k`, cut to
+so that the median is somewhere in the members' prior, and members rarely scatter as widely as that.
+Here :math:`F_k` is the normal distribution function of mean :math:`m_k` and sd :math:`s_k`, cut to
 the range: outside of it a forward map has no answer. So a member's density given the population is
 that of correlated normals, cut,
 
@@ -45,26 +46,30 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import numpyro
 import numpyro.distributions as dist
+from jax.scipy.linalg import solve_triangular
 from jax.scipy.special import ndtr, ndtri
 from jax.typing import ArrayLike
-from numpyro import handlers
 
-from calibrate.priors import log_normal, truncated, truncated_normal
+from calibrate.priors import truncated
 from calibrate.state_names import split
-from calibrate.statistical_model import Data, Model
+from calibrate.statistical_model import Model
 from calibrate.statistical_model.prior_range import standardised
 from emulator.core.errors import InputError
 from emulator.scenes.parameter_space import Parameter
 
-MEDIAN, SD, CHOLESKY, SCORES = "median", "sd", "correlation_cholesky", "scores"
+MEDIAN, SD, CHOLESKY = "median", "sd", "correlation_cholesky"
 _LEAST = 1e-300  # least mass at which ndtri is finite
 _FARTHEST = 30.0  # sd to which values farther from the mean are clipped
+_FAR = 8.3  # sd from the mean to both ends, from which a cut changes nothing in double precision
+_DRAWS = 4000  # of a prior, from which its sd is estimated
+_SCATTER = 0.5  # scale of the prior of the population's sd, over the sd of the members' prior
 
 
 def to_scale(parameter: Parameter, value: Any) -> Any:
@@ -117,9 +122,19 @@ def to_score(
     return jnp.where(upper, -q, q), slope
 
 
+class PopulationDraws(NamedTuple):
+    """Median and sd (k,) of a population, and the lower factor L (k, k) of its correlation."""
+
+    median: jax.Array
+    sd: jax.Array
+    factor: jax.Array
+
+
 @dataclass(frozen=True, eq=False)
 class PopulationModel:
-    """A NumPyro model of all members, called with data by member; see :func:`population_model`.
+    """A NumPyro model of what members share, and their density given it.
+
+    :func:`population_model` makes it.
 
     Parameters
     ----------
@@ -137,35 +152,19 @@ class PopulationModel:
     spread: Mapping[str, dist.Distribution]
     eta: float = 2.0
 
-    def __call__(self, data: Mapping[str, Data] | None = None) -> None:
-        """Run the NumPyro program; a member that ``data`` does not name has no likelihood."""
-        median = [
-            numpyro.sample(f"{MEDIAN}[{k}]", standardised(self.median[k])) for k in self.shared
-        ]
-        spread = [numpyro.sample(f"{SD}[{k}]", standardised(self.spread[k])) for k in self.shared]
-        count = len(self.shared)
-        factor = jnp.eye(count)
-        if count > 1:
-            factor = numpyro.sample(CHOLESKY, dist.LKJCholesky(count, concentration=self.eta))
-        normal = dist.Normal(0.0, 1.0).expand((len(self.members), count)).to_event(2)
-        z = numpyro.sample(SCORES, normal)
-        values = self.shared_values(jnp.stack(median), jnp.stack(spread), factor, z)
-        draws = {}
-        for i, (member, model) in enumerate(self.members.items()):
-            draws[member] = {name: values[name][i] for name in self.shared}
-            for name in self.unshared[member]:
-                prior = model.given_earlier(name, model.sampled_priors[name], draws[member])
-                draws[member][name] = numpyro.sample(f"{name}[{member}]", prior)
-        data = data or {}
-        groups: dict[int, tuple[Model, list[str]]] = {}  # one program for each model
-        for member, model in self.members.items():
-            if member in data:
-                groups.setdefault(id(model), (model, []))[1].append(member)
-        for model, names in groups.values():
-            stacked = [_stacked([by[n] for n in names]) for by in (draws, data)]
-            with handlers.block():
-                log_likelihoods = jax.vmap(model.map_log_likelihood)(*stacked)
-            numpyro.factor(f"data of {', '.join(names)}", jnp.sum(log_likelihoods))
+    def __call__(self) -> None:
+        """Run the NumPyro program of median, sd and correlation, from their priors."""
+        for name, prior in self.sampled_priors.items():
+            numpyro.sample(name, prior)
+
+    @cached_property
+    def sampled_priors(self) -> dict[str, dist.Distribution]:
+        """Prior of all that the population is, as NumPyro samples it."""
+        priors = {f"{MEDIAN}[{k}]": standardised(self.median[k]) for k in self.shared}
+        priors |= {f"{SD}[{k}]": standardised(self.spread[k]) for k in self.shared}
+        if len(self.shared) > 1:
+            priors[CHOLESKY] = dist.LKJCholesky(len(self.shared), concentration=self.eta)
+        return priors
 
     @cached_property
     def unshared(self) -> dict[str, tuple[str, ...]]:
@@ -175,27 +174,50 @@ class PopulationModel:
             for member, model in self.members.items()
         }
 
-    def shared_values(
-        self, median: jax.Array, spread: jax.Array, factor: jax.Array, z: jax.Array
-    ) -> dict[str, jax.Array]:
+    @cached_property
+    def ends(self) -> tuple[np.ndarray, np.ndarray]:
+        """Both ends of the ranges, (k,) each, on the parameters' scales."""
+        low, high = zip(*map(ends, self.shared.values()), strict=True)
+        return np.array(low), np.array(high)
+
+    def log_density(self, x: jax.Array, population: PopulationDraws) -> jax.Array:
+        """Return the log density (...,) of members' shared unknowns ``x`` (..., k).
+
+        ``x`` are on the parameters' scales; ``population`` is one draw.
+        """
+        mean, sd = self.means(population.median), population.sd
+
+        def uncut() -> tuple[jax.Array, jax.Array]:
+            return (x - mean) / sd, jnp.broadcast_to(sd, x.shape)
+
+        def cut() -> tuple[jax.Array, jax.Array]:
+            return to_score(x, mean, sd, *self.ends)
+
+        low, high = self.ends
+        far = jnp.all((mean - low > _FAR * sd) & (high - mean > _FAR * sd))
+        q, slope = jax.lax.cond(far, uncut, cut)
+        inverse = solve_triangular(population.factor, jnp.eye(len(self.shared)), lower=True)
+        z = jnp.einsum("kl,...l->...k", inverse, q)
+        determinant = jnp.sum(jnp.log(jnp.diagonal(population.factor)))
+        return -0.5 * jnp.sum(z**2, axis=-1) - jnp.sum(jnp.log(slope), axis=-1) - determinant
+
+    def shared_values(self, population: PopulationDraws, z: jax.Array) -> dict[str, jax.Array]:
         """Return shared unknowns by name, each (...), in their units.
 
         Parameters
         ----------
-        median, spread : the population's medians and sds (k,).
-        factor : the lower factor L (k, k) of its correlation. z : standard normal scores (..., k).
+        population : one draw of it. z : standard normal scores (..., k).
         """
-        q = jnp.einsum("kl,...l->...k", factor, z)
-        values = {}
-        for k, (name, parameter) in enumerate(self.shared.items()):
-            low, high = ends(parameter)
-            x = from_score(q[..., k], to_scale(parameter, median[k]), spread[k], low, high)
-            values[name] = from_scale(parameter, x)
-        return values
+        q = jnp.einsum("kl,...l->...k", population.factor, z)
+        x = from_score(q, self.means(population.median), population.sd, *self.ends)
+        return {
+            name: from_scale(parameter, x[..., k])
+            for k, (name, parameter) in enumerate(self.shared.items())
+        }
 
-
-def _stacked(members: Sequence[Mapping[str, Any]]) -> Any:
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(dict, members))
+    def means(self, median: jax.Array) -> jax.Array:
+        """Return the population's means (k,) on the parameters' scales."""
+        return jnp.stack([to_scale(p, median[k]) for k, p in enumerate(self.shared.values())])
 
 
 def population_model(
@@ -212,9 +234,11 @@ def population_model(
     ----------
     shared : the unknowns that follow the population; by default all that every member has and that
         are no parameters of its loads.
-    median : the prior of the population's median, by shared name, in the parameter's unit.
+    median : the prior of the population's median, by shared name, in the parameter's unit; by
+        default the first member's prior.
     spread : the prior of the population's sd on the parameter's scale (of the logarithm where that
-        is logarithmic), by shared name; a number is the scale of a half-normal.
+        is logarithmic), by shared name; a number is the scale of a half-normal, by default half of
+        the sd of the first member's prior.
 
     Raises
     ------
@@ -240,23 +264,26 @@ def population_model(
         for name in priors or {}:
             if name not in names:
                 raise InputError(f"hierarchy: {role} of '{name}'; shared: {', '.join(names)}")
-    medians: dict[str, dist.Distribution] = {}
+    first = next(iter(members.values()))
+    medians = {name: (median or {}).get(name, first.prior[name]) for name in parameters}
     spreads: dict[str, dist.Distribution] = {}
     for name, parameter in parameters.items():
-        low, high = ends(parameter)
-        middle, half = from_scale(parameter, 0.5 * (low + high)), 0.5 * (high - low)
-        kind = log_normal if parameter.scale == "log" else truncated_normal
-        usual = kind(middle, half, parameter.low, parameter.high)
-        medians[name] = (median or {}).get(name, usual)
-        prior = (spread or {}).get(name, 0.5 * half)
+        prior = (spread or {}).get(name)
+        if prior is None:
+            prior = _SCATTER * _sd_on_scale(parameter, first.prior[name])
         if not (isinstance(prior, dist.Distribution) or 0.0 < prior < math.inf):
             raise InputError(
                 f"hierarchy: spread of '{name}' is {prior}; give a number above 0, or a "
                 "distribution"
             )
         spreads[name] = prior if isinstance(prior, dist.Distribution) else dist.HalfNormal(prior)
-    cut = truncated(medians, next(iter(members.values())).forward.scene)
+    cut = truncated(medians, first.forward.scene)
     return PopulationModel(dict(members), parameters, cut, spreads, float(eta))
+
+
+def _sd_on_scale(parameter: Parameter, prior: dist.Distribution) -> float:
+    draws = prior.sample(jax.random.key(0), (_DRAWS,))
+    return float(jnp.std(to_scale(parameter, draws)))
 
 
 def _shared_names(members: Mapping[str, Model], names: Sequence[str] | None) -> tuple[str, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,8 +13,9 @@ import numpy as np
 import xarray as xr
 
 from calibrate.arviz import base
-from calibrate.population.density import PopulationDraws, density_of_population
+from calibrate.population.density import PopulationDensity
 from calibrate.population.model import MEDIAN, SD, PopulationModel
+from calibrate.population.second_stage import Stage
 from calibrate.posterior import predictions, read_tree
 from calibrate.posterior.box import BoxEnd, box_ends
 from calibrate.posterior.diagnosis import diagnose, summary_of
@@ -27,6 +28,10 @@ from emulator.mechanics.laws.law import Quantity
 from emulator.scenes.parameter_space import Parameter
 
 ALONE, NEW, CORRELATION = "alone", "new_member", "correlation"
+IN_USE = "draws_in_use"  # of each member
+SHAPE, SHARE = "pareto_shape", "effective_share"  # of the weights of the population's draws
+WEIGHS = "weighed"  # whether they are used
+_NEW = 0x85EBCA6B  # keeps the key of members not seen apart from the sampler's
 PARAMETER, MEMBER = "parameter", "member"
 _OTHER = "other_parameter"
 _ALONE_DRAWS = 1000  # kept of each member by itself
@@ -159,6 +164,20 @@ class Hierarchy(TableRepr):
 
     def warnings(self) -> list[str]:
         """Return a sentence for each fault of the run, with what to do; empty if there is none."""
+        return [*self._unweighed(), *self._of_chains()]
+
+    def _unweighed(self) -> Iterator[str]:
+        """Yield a sentence where the members' draws are too few to weigh the population's."""
+        if self.tree.attrs.get(WEIGHS, 1):
+            return
+        in_use = np.asarray(self.tree[ALONE][IN_USE])
+        worst = int(np.argmin(in_use))
+        yield (
+            f"the population rests on {in_use[worst]:.0f} draws of {self.members[worst]}, too few "
+            "to check it: it is that of normals fitted to the members; take more draws of each"
+        )
+
+    def _of_chains(self) -> list[str]:
         statistics = {str(n): v.values for n, v in self.tree["sample_stats"].data_vars.items()}
         return [*diagnose(self.draws(), statistics, self.summary(), {}, self.box_ends())]
 
@@ -192,30 +211,26 @@ def read_hierarchy(path: str | Path) -> Hierarchy:
 
 
 def make_tree(
-    model: PopulationModel,
-    draws: tuple[PopulationDraws, jax.Array, Mapping[str, Any]],
-    shape: tuple[int, int],
-    statistics: Mapping[str, Any],
-    rng_key: jax.Array,
+    model: PopulationModel, density: PopulationDensity, stage: Stage, seed: int
 ) -> xr.DataTree:
-    """Return the groups ``posterior``, ``new_member`` and ``sample_stats``.
-
-    Parameters
-    ----------
-    draws : population, scores and own unknowns (s, ...), of ``shape`` (chains, draws).
-    rng_key : the key of the member not seen.
-    """
-    population, scores, member_values = draws
-    new = jax.random.normal(rng_key, (len(scores), scores.shape[-1]))
-    values = density_of_population(model).values
+    """Return the groups ``posterior``, ``new_member`` and ``sample_stats``, and its weights."""
+    shape, rows = stage.draws.z.shape[:2], stage.rows(seed)
+    population = density.constrain(jnp.asarray(stage.draws.z).reshape(-1, density.dimension)[rows])
+    chosen = stage.weighed.member_draws[rows].T
+    members = {
+        member: {name: values[draws] for name, values in stage.members[member].items()}
+        for member, draws in zip(model.members, chosen, strict=True)
+    }
     correlation = np.einsum("...ik,...jk->...ij", population.factor, population.factor)
     posterior = {
         MEDIAN: population.median,
         SD: population.sd,
         CORRELATION: correlation,
-        **values(*population, scores),
-        **member_values,
-    }
+        **{name: np.stack([draws[name] for draws in members.values()], axis=1)
+           for name in model.shared},
+        **{f"{name}[{member}]": members[member][name]
+           for member, names in model.unshared.items() for name in names},
+    }  # fmt: skip
 
     def by_chain(draws: Mapping[str, Any]) -> dict[str, np.ndarray]:
         return {n: np.asarray(v).reshape(*shape, *v.shape[1:]) for n, v in draws.items()}
@@ -223,11 +238,14 @@ def make_tree(
     names = list(model.shared)
     dims = {MEDIAN: [PARAMETER], SD: [PARAMETER], CORRELATION: [PARAMETER, _OTHER]}
     tree = base.from_dict(
-        {"posterior": by_chain(posterior), "sample_stats": dict(statistics)},
+        {"posterior": by_chain(posterior), "sample_stats": dict(stage.draws.statistics)},
         dims=dims | {name: [MEMBER] for name in names},
         coords={PARAMETER: names, _OTHER: names, MEMBER: list(model.members)},
     )
-    tree[NEW] = xr.DataTree(base.dict_to_dataset(by_chain(values(*population, new))))
+    key = jax.random.fold_in(jax.random.key(seed), _NEW)
+    scores = jax.random.normal(key, (len(rows), len(names)))
+    new = density.values(population, scores)
+    tree[NEW] = xr.DataTree(base.dict_to_dataset(by_chain(new)))
     for name, parameter in model.shared.items():
         for group in ("posterior", NEW):
             tree[group][name].attrs.update(units=parameter.unit or "1", scale=parameter.scale)
@@ -235,15 +253,21 @@ def make_tree(
             limits = next(iter(model.members.values())).forward.scene.quantities[name]
             box = [parameter.low, parameter.high, limits.low, limits.high]
             tree["posterior"][name].attrs["box"] = box
+    tree.attrs.update({SHAPE: stage.shape, SHARE: stage.share, WEIGHS: int(stage.weighs)})
     return tree
 
 
-def tree_of_alone(draws: Mapping[str, Mapping[str, np.ndarray]]) -> xr.DataTree:
-    """Return the group ``alone``: draws of each member, evenly spaced."""
+def tree_of_alone(
+    draws: Mapping[str, Mapping[str, np.ndarray]], names: tuple[str, ...], in_use: np.ndarray
+) -> xr.DataTree:
+    """Return the group ``alone``: draws of each member, evenly spaced, and how many are in use."""
 
     def spaced(values: np.ndarray) -> np.ndarray:
         return values[np.linspace(0, len(values) - 1, _ALONE_DRAWS).astype(int)]
 
-    names, members = next(iter(draws.values())), draws.values()
-    variables = {n: ((MEMBER, "draw"), np.stack([spaced(by[n]) for by in members])) for n in names}
+    members = draws.values()
+    variables: dict[str, Any] = {
+        n: ((MEMBER, "draw"), np.stack([spaced(by[n]) for by in members])) for n in names
+    }
+    variables[IN_USE] = ((MEMBER,), in_use)
     return xr.DataTree(xr.Dataset(variables, coords={MEMBER: list(draws)}))

@@ -19,7 +19,6 @@ from tqdm import tqdm
 
 from calibrate.figures import shrinkage
 from calibrate.population import Hierarchy, population_model, read_hierarchy, sample_population
-from calibrate.population.sample import TARGET_ACCEPT
 from calibrate.posterior import Posterior
 from calibrate.priors import log_normal
 from calibrate.project.calibration import NOT_CERTIFIED, certify_and_keep, infer
@@ -31,7 +30,6 @@ from calibrate.project.results import (
     POSTERIOR,
     REPORT,
     RUN,
-    SAMPLING,
     holds_population,
     is_of,
     read_posterior,
@@ -156,7 +154,7 @@ def infer_members(
         posteriors, verdicts = _calibrated(calibration, engine_of(executor))
         plan = _of_members_left(plan, posteriors, verdicts)
         _write_plan(folder, plan, {n: v for n, v in verdicts.items() if n not in posteriors})
-        hierarchy = _sample_together(plan, posteriors, folder / SAMPLING, progress=progress)
+        hierarchy = _sample_together(plan, posteriors, progress=progress)
         shrinkage.draw(hierarchy, folder / SHRINKAGE)
         hierarchy.save(folder / POSTERIOR)
     return hierarchy, verdicts
@@ -303,14 +301,12 @@ def _written_verdict(folder: Path) -> str | None:
 
 
 def _sample_together(
-    plan: Members, posteriors: Mapping[str, Posterior], checkpoint: Path, *, progress: bool
+    plan: Members, posteriors: Mapping[str, Posterior], *, progress: bool
 ) -> Hierarchy:
     """Sample all members by NUTS; the first one's run says for how long and with which seed."""
     run, shared = next(iter(plan.members.values())), plan.population
     own_options = run.sampler_options if run.sampler in (AUTO.name, NUTS.name) else {}
-    by_nuts = replace(
-        run, sampler=NUTS.name, sampler_options={"target_accept": TARGET_ACCEPT, **own_options}
-    )
+    by_nuts = replace(run, sampler=NUTS.name, sampler_options=own_options)
     models: dict[tuple[Any, ...], Model] = {}  # one for all members that differ in their data only
     model = population_model(
         {
@@ -331,7 +327,6 @@ def _sample_together(
         alone={name: posterior.draws() for name, posterior in posteriors.items()},
         seed=run.seed,
         progress=progress,
-        checkpoint=checkpoint,
     )
 
 

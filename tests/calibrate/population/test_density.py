@@ -1,19 +1,17 @@
-"""The density of a hierarchy, term by term, and in any coordinates."""
+"""The density of a population, term by term, its members integrated out, and weights by draws."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.special import logsumexp
 
 import calibrate as cal
 from calibrate.population import population_model
-from calibrate.population.density import (
-    Conditions,
-    Information,
-    density_of_population,
-    information_of,
-)
+from calibrate.population.density import Alone, density_of_population, log_likelihoods
+from calibrate.population.mixtures import Mixtures, likelihood_of, stacked
+from calibrate.population.model import PopulationDraws
 from linear_support import linear_forward
 
 LOW, HIGH = np.log(50.0), np.log(100.0)
@@ -21,99 +19,78 @@ LOW, HIGH = np.log(50.0), np.log(100.0)
 
 @pytest.fixture(scope="module")
 def model(beam):
-    """Two members of two parameters, one with an unknown noise sd."""
+    """Two members of two parameters."""
     forward, observe = linear_forward(beam), cal.nodal_displacements(beam, [3, 11, 20])
-    known = cal.model(forward, observe, cal.GaussianNoise(sd=0.1), check_scale=False)
-    unknown = cal.model(forward, observe, cal.GaussianNoise(sd_scale=0.1), check_scale=False)
-    return population_model({"first": known, "second": unknown}, eta=3.0)
+    member = cal.model(forward, observe, cal.GaussianNoise(sd=0.1), check_scale=False)
+    return population_model({"first": member, "second": member}, eta=3.0)
 
 
-def of_nothing():
-    return Information(jnp.full((2, 2), 4.2), jnp.zeros((2, 2)), jnp.zeros((2, 2, 2)))
+@pytest.fixture(scope="module")
+def mixtures():
+    """One part of data, and two parts of which one says nothing of the second parameter."""
+    one = Mixtures(
+        np.array([4.2, 4.3]), np.array([0.3]), np.array([[8.0, -20.0]]),
+        np.array([[[400.0, 90.0], [90.0, 50.0]]]),
+    )  # fmt: skip
+    two = Mixtures(
+        np.array([4.3, 4.2]), np.array([-1.0, 0.5]), np.array([[30.0, 0.0], [-40.0, 60.0]]),
+        np.array([[[900.0, 0.0], [0.0, 0.0]], [[300.0, -50.0], [-50.0, 600.0]]]),
+    )  # fmt: skip
+    return stacked([one, two])
 
 
-def of_data():
-    precision = jnp.array([[[400.0, 90.0], [90.0, 50.0]], [[3.0, -1.0], [-1.0, 900.0]]])
-    return Information(
-        jnp.array([[4.0, 4.5], [4.3, 4.58]]), jnp.array([[2.0, -3.0], [8.0, 0.5]]), precision
-    )
+def population(median=(70.0, 75.0), sd=(0.05, 0.08), r=-0.6):
+    factor = np.linalg.cholesky(np.array([[1.0, r], [r, 1.0]]))
+    return PopulationDraws(*map(jnp.array, (median, sd, factor)))
 
 
-def points(density):
-    return jax.random.normal(jax.random.key(3), (4, density.dimension))
+def test_the_integral_over_a_member_is_that_of_a_grid(model, mixtures):
+    """Of the sum of parts times the population's normal, by quadrature."""
+    some = population()
+    found = np.asarray(log_likelihoods(model, some, mixtures))
+    m, M = np.log(np.asarray(some.median)), np.asarray(some.sd)[:, None] * np.asarray(some.factor)
+    nodes, weights = np.polynomial.hermite_e.hermegauss(80)
+    z = np.stack(np.meshgrid(nodes, nodes, indexing="ij"), axis=-1).reshape(-1, 2)
+    log_weight = np.log(np.outer(weights, weights).ravel() / (2.0 * np.pi))
+    x = m + z @ M.T
+    a, b = ((end - m) / np.asarray(some.sd) for end in (LOW, HIGH))
+    mass = np.log(stats.norm.cdf(b) - stats.norm.cdf(a)).sum()
+    for i in range(2):
+        t = x - mixtures.centre[i]
+        parts = mixtures.constant[i][:, None] + mixtures.slope[i] @ t.T
+        parts = parts - 0.5 * np.einsum("sk,jkl,sl->js", t, mixtures.precision[i], t)
+        expected = logsumexp(log_weight + logsumexp(parts, axis=0)) - mass
+        assert found[i] == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.slow
-def test_coordinates_do_not_change_the_density(model):
-    """p(w) = p(w') |det dw'/dw|, with w' the coordinates of members whose data say nothing."""
-    density = density_of_population(model)
-    data = {m: {"displacement": jnp.full((3, 3), 0.5)} for m in model.members}
-    place = slice(_first_score(density), _first_score(density) + 4)
-
-    log_density = jax.jit(density.log_density)
-
-    @jax.jit
-    def plain(w):
-        _, scores, _ = density.constrain(w[None], of_data())
-        return w.at[place].set(scores.reshape(-1))
-
-    for w in points(density):
-        height = log_density(plain(w), Conditions(data, of_nothing()))
-        _, change = np.linalg.slogdet(np.asarray(jax.jit(jax.jacfwd(plain))(w)))
-        found = log_density(w, Conditions(data, of_data()))
-        np.testing.assert_allclose(found, height + change, rtol=1e-9)
-
-
-def _first_score(density):
-    """Where the scores are in the flat vector: what the members' scores alone depend on."""
-    w = jnp.zeros(density.dimension)
-    slopes = jax.jacfwd(lambda w: density.constrain(w[None], of_nothing())[1].ravel())(w)
-    return int(np.flatnonzero(np.abs(slopes).sum(axis=0))[0])
-
-
-def test_each_term_is_the_one_documented(model):
+def test_its_prior_is_the_one_documented(model, mixtures):
     """Up to a constant; positive and bounded unknowns have the Jacobian of their logarithm, ..."""
     density = density_of_population(model)
-    data = {"first": {"displacement": jnp.full((3, 3), 0.8)}}
-    noise = model.members["second"].sampled_priors["noise_sd"]
-
-    @jax.jit
-    def terms(w):
-        population, z, own = density.constrain(w[None], of_nothing())
-        values = model.shared_values(*(part[0] for part in population), z[0])
-        first = {name: v[0] for name, v in values.items()}
-        return (
-            population, z, own, noise.log_prob(own["noise_sd[second]"][0]),
-            model.members["first"].map_log_likelihood(first, data["first"]),
-            density.log_density(w, Conditions(data, of_nothing())),
-        )  # fmt: skip
-
     different = []
-    for w in points(density):
-        population, z, own, of_noise, of_first, found = terms(w)
-        m, s = np.log(population.median[0]), np.asarray(population.sd[0])
-        correlation = np.asarray(population.factor[0] @ population.factor[0].T)
-        expected = stats.norm.logpdf(m, (LOW + HIGH) / 2, (HIGH - LOW) / 2).sum()
-        # theta in (low, high) by the sigmoid: of m, d theta/dw = m' (theta - low)(high - theta)
-        theta = np.asarray(population.median[0])
-        expected += np.log((theta - 50.0) * (100.0 - theta) / theta).sum()
-        expected += stats.halfnorm.logpdf(s, scale=(HIGH - LOW) / 4).sum() + np.log(s).sum()
-        r = correlation[0, 1]
-        expected += 2.0 * np.log1p(-(r**2)) + np.log1p(-(r**2))  # det(R)^(eta - 1), dr/dw
-        expected += stats.norm.logpdf(z).sum()
-        expected += float(of_noise) + np.log(own["noise_sd[second]"][0]) + float(of_first)
-        different.append(float(found) - expected)
-    np.testing.assert_allclose(different, different[0], rtol=1e-8)
+    for z in jax.random.normal(jax.random.key(3), (4, density.dimension)):
+        some = jax.tree.map(lambda values: values[0], density.constrain(z[None]))
+        s, theta = np.asarray(some.sd), np.asarray(some.median)
+        # log-uniform, and theta in (low, high) by the sigmoid: d theta/dz = (t - l)(h - t) / (h - l)
+        expected = np.log((theta - 50.0) * (100.0 - theta) / theta).sum()
+        scale = 0.5 * (HIGH - LOW) / np.sqrt(12.0)
+        expected += stats.halfnorm.logpdf(s, scale=scale).sum() + np.log(s).sum()
+        r = float((some.factor @ some.factor.T)[0, 1])
+        expected += 2.0 * np.log1p(-(r**2)) + np.log1p(-(r**2))  # det(R)^(eta - 1), dr/dz
+        expected += np.asarray(log_likelihoods(model, some, mixtures)).sum()
+        different.append(float(density.log_density(z, mixtures)) - expected)
+    # The sd of the prior is that of draws, so that the scale is known to some per cent.
+    np.testing.assert_allclose(different, different[0], atol=0.1)
 
 
-def test_a_member_has_the_density_documented(model):
+@pytest.mark.parametrize("median", [(70.0, 95.0), (52.0, 99.0)])
+def test_a_member_has_the_density_documented(model, median):
     """Of x by a change of variables from z, and as the cut normals of a Gaussian copula."""
-    median, sd, r = np.array([70.0, 95.0]), np.array([0.15, 0.1]), -0.6
-    factor = np.linalg.cholesky(np.array([[1.0, r], [r, 1.0]]))
-    m, z = np.log(median), np.array([0.4, -1.1])
+    some = population(median, (0.15, 0.1))
+    m, sd, factor = np.log(np.array(median)), np.array([0.15, 0.1]), np.asarray(some.factor)
+    z = np.array([0.4, -1.1])
 
     def x(z):
-        values = model.shared_values(jnp.array(median), jnp.array(sd), jnp.array(factor), z)
+        values = model.shared_values(some, z)
         return jnp.log(jnp.stack([values["mu"], values["lam"]]))
 
     value, slopes = np.asarray(x(jnp.array(z))), np.asarray(jax.jacfwd(x)(jnp.array(z)))
@@ -125,16 +102,69 @@ def test_a_member_has_the_density_documented(model):
     documented = copula - stats.norm.logpdf(q).sum()
     documented += (stats.norm.logpdf(value, m, sd) - np.log(mass)).sum()
     np.testing.assert_allclose(by_change, documented, rtol=1e-9)
+    found = float(model.log_density(jnp.asarray(value), some)) - np.log(2.0 * np.pi)
+    assert found == pytest.approx(documented, rel=1e-9)
 
 
-def test_the_information_of_gaussian_draws_is_that_of_the_data():
-    """Prior N(0, 1), (0, 4); data of x_1 + x_2 = 3 with sd 0.1: closed form."""
-    rng = np.random.default_rng(0)
-    prior_sd, direction = np.array([1.0, 2.0]), np.array([[1.0], [1.0]])
+def test_a_cut_that_is_far_away_is_none(model):
+    """Where both ends are more than 8.3 sd away, the density is that of the normal."""
+    value = jnp.log(jnp.array([[70.0, 71.0], [73.0, 69.0]]))
+    for sd in (0.02, 0.05):  # without and with the cut's formulas
+        some = population((71.0, 70.0), (sd, sd))
+        covariance = sd**2 * np.asarray(some.factor @ some.factor.T)
+        mean = np.log(np.array([71.0, 70.0]))
+        expected = stats.multivariate_normal.logpdf(np.asarray(value), mean, covariance)
+        found = np.asarray(model.log_density(value, some)) - np.log(2.0 * np.pi)
+        np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["normal", "uniform"])
+def test_the_likelihood_of_gaussian_draws_is_that_of_the_data(kind):
+    """Data of x_1 + x_2 = 3 with sd 0.1, under a normal and a uniform prior: closed form."""
+    rng, direction = np.random.default_rng(0), np.ones((2, 1))
     precision = direction @ direction.T / 0.01
-    covariance = np.linalg.inv(precision + np.diag(prior_sd**-2))
-    mean = covariance @ direction[:, 0] * 3.0 / 0.01
-    draws = rng.multivariate_normal(mean, covariance, 200_000)
-    value, slope, found = information_of(draws, prior_sd * rng.normal(size=(200_000, 2)))
-    np.testing.assert_allclose(found, precision, rtol=0.02)
-    np.testing.assert_allclose(slope, value / prior_sd**2, rtol=0.05)
+    shift = direction[:, 0] * 3.0 / 0.01
+    if kind == "normal":
+        sd = np.array([1.0, 2.0])
+        prior = sd * rng.normal(size=(200_000, 2))
+        covariance = np.linalg.inv(precision + np.diag(sd**-2.0))
+        draws = rng.multivariate_normal(covariance @ shift, covariance, 200_000)
+        log_prior = -0.5 * np.sum((draws / sd) ** 2, axis=1)
+    else:
+        prior = rng.uniform(-3.0, 5.0, size=(200_000, 2))
+        first = rng.uniform(-3.0, 5.0, size=1_000_000)
+        draws = np.stack([first, 3.0 - first + 0.1 * rng.normal(size=first.size)], axis=1)
+        draws = draws[(draws[:, 1] > -3.0) & (draws[:, 1] < 5.0)][:200_000]
+        log_prior = np.zeros(len(draws))
+    found = likelihood_of(draws, log_prior, prior, rng)
+    # Along the line data say nothing, however the prior ends there.
+    inside = np.array([[1.0, 2.0], [1.02, 2.1], [0.4, 2.6], [1.9, 1.0]])
+    t = inside - found.centre
+    parts = found.constant + t @ found.slope.T
+    parts = parts - 0.5 * np.einsum("sk,jkl,sl->sj", t, found.precision, t)
+    heights = logsumexp(parts, axis=1)
+    expected = -0.5 * ((inside.sum(axis=1) - 3.0) / 0.1) ** 2
+    tolerance = 0.05 if kind == "normal" else 0.25
+    np.testing.assert_allclose(heights - heights[0], expected - expected[0], atol=tolerance)
+
+
+def test_members_draws_are_weighted_by_population_over_prior(model, mixtures):
+    """Log weights and chosen draws of two populations, by hand."""
+    density, rng = density_of_population(model), np.random.default_rng(2)
+    x = np.log(rng.uniform(60.0, 90.0, size=(2, 50, 2)))
+    log_prior = rng.normal(size=(2, 50))
+    z = np.repeat(np.asarray(jax.random.normal(jax.random.key(1), (2, density.dimension))), 4000, 0)
+    weighed = density.weigh(jax.random.key(0), z, mixtures, Alone(x, log_prior))
+    drawn = density.constrain(jnp.asarray(z[[0, -1]]))
+    for k, rows in enumerate((slice(0, 4000), slice(4000, 8000))):
+        some = jax.tree.map(lambda values, k=k: values[k], drawn)
+        log_weights = np.asarray(model.log_density(jnp.asarray(x), some)) - log_prior
+        exact = logsumexp(log_weights, axis=1)
+        expected = (exact - np.asarray(log_likelihoods(model, some, mixtures))).sum()
+        np.testing.assert_allclose(weighed.log_weight[rows], expected, rtol=1e-9)
+        shares = np.exp(log_weights - exact[:, None])
+        for i in range(2):
+            counts = np.bincount(weighed.member_draws[rows, i], minlength=50) / 4000.0
+            assert np.abs(counts - shares[i]).max() < 5.0 * np.sqrt(0.25 / 4000.0)
+    assert weighed.in_use.shape == (2,)
+    assert np.all((weighed.in_use >= 1.0) & (weighed.in_use <= 50.0))

@@ -15,10 +15,11 @@ from emulator.scenes.parameter_space import LogNormal
 from linear_support import linear_forward
 
 
-def model_of(scene, *states):
+def model_of(scene, *states, **more):
     part = cal.nodal_displacements(scene, [3, 11])
     parts = {f"displacement@{state}": part for state in states} if states else part
-    return cal.model(linear_forward(scene), parts, cal.GaussianNoise(sd=0.1), check_scale=False)
+    noise = cal.GaussianNoise(sd=0.1)
+    return cal.model(linear_forward(scene), parts, noise, check_scale=False, **more)
 
 
 def test_loads_and_noise_are_a_member_s_own(ventricle):
@@ -42,13 +43,17 @@ def test_nothing_in_common_is_refused(ventricle):
         population_model({"one": model, "two": bare})
 
 
-def test_priors_are_on_the_parameter_s_scale(beam):
-    found = population_model({"one": model_of(beam)})
-    draws = np.asarray(found.spread["mu"].sample(jax.random.key(0), (20_000,)))
-    assert np.sqrt(np.mean(draws**2)) == pytest.approx(0.25 * np.log(2.0), rel=0.03)
-    medians = np.log(np.asarray(found.median["mu"].sample(jax.random.key(1), (5000,))))
-    assert medians.mean() == pytest.approx(0.5 * np.log(50.0 * 100.0), abs=0.01)
-    assert medians.std() == pytest.approx(0.54 * 0.5 * np.log(2.0), rel=0.05)  # cut at one sd
+def test_the_population_s_priors_are_made_of_the_members(beam):
+    """The median has theirs, the sd is rarely as large as theirs; on the parameter's scale."""
+    box = population_model({"one": model_of(beam)})
+    prior = cal.priors.Population({"mu": 70.0}, {"mu": 0.05}).prior(beam)
+    stated = population_model({"one": model_of(beam, prior=prior)}, shared=("mu",))
+    for found, sd in ((box, np.log(2.0) / np.sqrt(12.0)), (stated, 0.05)):
+        spreads = np.asarray(found.spread["mu"].sample(jax.random.key(0), (20_000,)))
+        assert np.sqrt(np.mean(spreads**2)) == pytest.approx(0.5 * sd, rel=0.05)
+        medians = np.log(np.asarray(found.median["mu"].sample(jax.random.key(1), (5000,))))
+        assert medians.mean() == pytest.approx(np.log(np.sqrt(5000.0)), abs=0.02)
+        assert medians.std() == pytest.approx(sd, rel=0.05)
 
 
 def test_members_share_ranges_but_not_what_their_scene_files_say_of_them():
