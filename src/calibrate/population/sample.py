@@ -129,7 +129,8 @@ def _members(
             draws: Mapping[str, Any] = posterior.draws()
         else:
             density = density_of(member_model)
-            draws = density.constrain(jnp.asarray(prior_draws(density, jax.random.key(seed + i), DRAWS)))
+            z = prior_draws(density, jax.random.key(seed + i), DRAWS)
+            draws = density.constrain(jnp.asarray(z))
         by_member[member] = {name: np.asarray(values) for name, values in draws.items()}
     return by_member
 

@@ -303,7 +303,7 @@ def _written_verdict(folder: Path) -> str | None:
 def _sample_together(
     plan: Members, posteriors: Mapping[str, Posterior], *, progress: bool
 ) -> Hierarchy:
-    """Sample all members by NUTS; the first one's run says for how long and with which seed."""
+    """Sample the population; the first member's run says for how long and with which seed."""
     run, shared = next(iter(plan.members.values())), plan.population
     own_options = run.sampler_options if run.sampler in (AUTO.name, NUTS.name) else {}
     by_nuts = replace(run, sampler=NUTS.name, sampler_options=own_options)

@@ -59,6 +59,11 @@ def _simulator(
 ) -> EquilibriumSolver:
     if isinstance(scene, Scene):
         return Simulator(scene, NewtonOptions.load_steps(load_steps, most=100), executor)
+    if load_steps != 1:
+        raise InputError(
+            f"load steps {load_steps}: '{scene.name}' is solved in steps of its own; leave "
+            "--load-steps out"
+        )
     (made,) = offered(*scene.solved_by.split(":"))
     solver: EquilibriumSolver = made(scene, executor=executor)
     return solver

@@ -9,6 +9,7 @@ from numpyro import handlers
 import calibrate as cal
 from calibrate.analysis.sbc import LOG_LIKELIHOOD, Replicate, calibration_of
 from calibrate.population import population_model, sample_population
+from calibrate.population.model import PopulationDraws
 from calibrate.samplers import NUTSOptions
 from linear_support import linear_forward
 
@@ -17,12 +18,14 @@ NODES, NOISE, RANKED = np.array([3, 11, 20]), 0.1, 99
 
 def twin(model, forward, seed):
     """Unknowns by the names of Hierarchy.draws, and data by member, from the prior."""
+    score_key = jax.random.fold_in(jax.random.key(seed), 1)
     seeded = handlers.seed(model, jax.random.key(seed))
     sites = {k: v["value"] for k, v in handlers.trace(seeded).get_trace().items()}
     names = list(model.shared)
     median, sd = (jnp.stack([sites[f"{r}[{n}]"] for n in names]) for r in ("median", "sd"))
     factor = sites.get("correlation_cholesky", jnp.eye(len(names)))
-    values = model.shared_values(median, sd, factor, sites["scores"])
+    scores = jax.random.normal(score_key, (len(model.members), len(names)))
+    values = model.shared_values(PopulationDraws(median, sd, factor), scores)
     truth = {k: float(v) for k, v in sites.items() if k.startswith(("median", "sd"))}
     if len(names) > 1:
         truth["correlation[mu, lam]"] = float((factor @ factor.T)[0, 1])
@@ -55,7 +58,7 @@ def calibrated(beam, members, replicates, options, **more):
 
     def one(seed):
         truth, data = twin(model, forward, seed)
-        found = sample_population(model, data, options=options, alone="laplace", seed=seed)
+        found = sample_population(model, data, options=options, seed=seed)
         rows = np.linspace(0, options.chains * options.draws - 1, RANKED).astype(int)
         draws = {name: values.reshape(-1)[rows] for name, values in found.draws().items()}
         assert set(draws) == set(truth)

@@ -98,6 +98,10 @@ def test_simulate_tells_each_row_and_the_error_of_its_steps(folder, capsys):
         (["infer", "--observe", "landmarks:5", "--out", "x"], "there are volume, length, reaction"),
         (["infer", "--observe", "reaction:roof:x", "--out", "x"], "has no support on 'roof'"),
         (["infer", "--observe", "volume", "--out", "x"], "has 0 cavities"),
+        (
+            ["infer", "--observe", FORCE, "--noise", f"{FORCE}=1", "--load-steps", "4", "--out", "x"],
+            "is solved in steps of its own",
+        ),
         (["train", "--out", "x"], "goes through a history"),
         (["campaign", "--samples", "2", "--out", "x.zarr"], "goes through a history"),
         (["unload", "--theta", "mu=8", "relaxation_1=0.5"], "goes through a history"),
