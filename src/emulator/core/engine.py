@@ -20,12 +20,14 @@ import os
 import pickle
 import platform
 import sys
+import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass, fields, is_dataclass
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
+from multiprocessing import connection
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -323,6 +325,22 @@ def engine_of(executor: Executor | str | None) -> Engine | None:
     return _named(executor)
 
 
+def end_with_parent() -> None:
+    """End this worker when the process that began it has died.
+
+    A killed process closes nothing, and its workers hold each other's pipes open: they would wait
+    for tasks, with all that they have compiled, until the machine stops.
+    """
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+
+        def wait() -> None:
+            connection.wait([parent.sentinel])
+            os._exit(1)
+
+        threading.Thread(target=wait, daemon=True).start()
+
+
 @cache
 def _named(words: str) -> Engine:
     """Return the engine of ``words``, of which this process has one: its workers compiled much."""
@@ -330,7 +348,7 @@ def _named(words: str) -> Engine:
     if kind == "processes":
         # Not by fork: JAX has threads.
         context = multiprocessing.get_context("spawn")
-        renewed = lambda: ProcessPoolExecutor(int(rest), mp_context=context)  # noqa: E731
+        renewed = partial(ProcessPoolExecutor, int(rest), context, end_with_parent)
         return Engine(renewed(), int(rest), renewed)
     try:
         from distributed import Client

@@ -2,10 +2,13 @@
 
 import os
 import signal
+import subprocess
+import sys
 import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
 from operator import neg
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -133,6 +136,46 @@ def test_tasks_of_a_worker_that_is_killed_are_done_again_and_named(tmp_path, cap
     engine = engine_of(PROCESSES)
     assert list(engine.in_order(die_once, iter([str(mark)] * 4))) == [1, 1, 1, 1]
     assert "a worker died; done again: run 1" in capsys.readouterr().err
+
+
+PROGRAM = """
+import os
+from emulator.core.engine import engine_of
+
+def place(_):
+    return os.getpid()
+
+if __name__ == "__main__":
+    for number in engine_of("processes:2").in_order(place, iter([0, 1])):
+        print(number, flush=True)
+    input()
+"""
+
+
+def _lives(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    status = Path(f"/proc/{pid}/stat")
+    return not status.exists() or status.read_text().split(")")[-1].split()[0] != "Z"
+
+
+@pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGKILL])
+def test_workers_end_with_the_process_that_began_them(tmp_path, end):
+    (tmp_path / "program.py").write_text(PROGRAM)
+    words = [sys.executable, str(tmp_path / "program.py")]
+    with subprocess.Popen(
+        words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as program:
+        workers = [int(program.stdout.readline()) for _ in range(2)]
+        assert all(map(_lives, workers))
+        program.send_signal(end)
+        program.wait(timeout=10)
+        limit = time.monotonic() + 10.0
+        while any(map(_lives, workers)) and time.monotonic() < limit:
+            time.sleep(0.05)
+        assert not any(map(_lives, workers))
 
 
 def test_a_task_that_kills_every_worker_is_named():
