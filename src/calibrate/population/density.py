@@ -24,7 +24,9 @@ Both are approximations, and the draws know better: with :math:`x_{ij}` as draws
 
 with the exact density of :mod:`calibrate.population.model` (Lunn, Barrett, Sweeting and Thompson
 2013 sample members so). The ratio of both weighs the population's draws. A member of a draw of the
-population is one of its draws, in proportion to :math:`w_{ij}`.
+population is one of its draws, in proportion to :math:`w_{ij}`. The sums are over few draws where
+the population is narrow: with shares :math:`v_{ij}` of the sum, the variance of the log likelihood
+is about :math:`\sum_i (\sum_j v_{ij}^2 - 1/S)`.
 """
 
 from __future__ import annotations
@@ -65,11 +67,13 @@ class Weighed(NamedTuple):
     """The draws of the members at draws of the population.
 
     log_weight : (s,) of the population's draws, by the exact density over the mixtures'.
+    variance : (s,) of the log likelihood of each, from the number of draws that count there.
     member_draws : (s, n) the draw that each member has.
     in_use : (n,) the number of each member's draws that they rest on.
     """
 
     log_weight: np.ndarray
+    variance: np.ndarray
     member_draws: np.ndarray
     in_use: np.ndarray
 
@@ -111,23 +115,25 @@ def density_of_population(model: PopulationModel) -> PopulationDensity:
     def at_draws(
         keys: jax.Array, z: jax.Array, mixtures: Mixtures, alone: Alone
     ) -> tuple[jax.Array, ...]:
-        def at(key_and_z: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        def at(key_and_z: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, ...]:
             key, z = key_and_z
             population = population_at(z)
             log_weights = model.log_density(alone.x, population) - alone.log_prior
             exact = jax.nn.logsumexp(log_weights, axis=1)
             ratio = exact - log_likelihoods(model, population, mixtures)
-            shares = jnp.cumsum(jnp.exp(log_weights - exact[:, None]), axis=1)
-            at = jax.random.uniform(key, (len(shares),)) * shares[:, -1]
-            return jnp.sum(ratio), jnp.sum(shares < at[:, None], axis=1)
+            shares = jnp.exp(log_weights - exact[:, None])
+            variance = jnp.sum(jnp.sum(shares**2, axis=1) - 1.0 / shares.shape[1])
+            sums = jnp.cumsum(shares, axis=1)
+            at = jax.random.uniform(key, (len(sums),)) * sums[:, -1]
+            return jnp.sum(ratio), variance, jnp.sum(sums < at[:, None], axis=1)
 
         return jax.lax.map(at, (keys, z))
 
     def weigh(key: jax.Array, z: np.ndarray, mixtures: Mixtures, alone: Alone) -> Weighed:
-        log_weight, chosen = map(
+        log_weight, variance, chosen = map(
             np.asarray, at_draws(jax.random.split(key, len(z)), jnp.asarray(z), mixtures, alone)
         )
-        return Weighed(log_weight, chosen, np.array([_in_use(column) for column in chosen.T]))
+        return Weighed(log_weight, variance, chosen, np.array([_in_use(column) for column in chosen.T]))
 
     return PopulationDensity(
         log_density,

@@ -29,7 +29,8 @@ from emulator.scenes.parameter_space import Parameter
 
 ALONE, NEW, CORRELATION = "alone", "new_member", "correlation"
 IN_USE = "draws_in_use"  # of each member
-SHAPE, SHARE = "pareto_shape", "effective_share"  # of the weights of the population's draws
+# Of the weights of the population's draws; the last is in nats of the log likelihood.
+SHAPE, SHARE, ERROR = "pareto_shape", "effective_share", "log_likelihood_error"
 WEIGHS = "weighed"  # whether they are used
 _NEW = 0x85EBCA6B  # keeps the key of members not seen apart from the sampler's
 PARAMETER, MEMBER = "parameter", "member"
@@ -253,7 +254,8 @@ def make_tree(
             limits = next(iter(model.members.values())).forward.scene.quantities[name]
             box = [parameter.low, parameter.high, limits.low, limits.high]
             tree["posterior"][name].attrs["box"] = box
-    tree.attrs.update({SHAPE: stage.shape, SHARE: stage.share, WEIGHS: int(stage.weighs)})
+    tree.attrs |= {SHAPE: stage.shape, SHARE: stage.share, ERROR: stage.error}
+    tree.attrs[WEIGHS] = int(stage.weighs)
     return tree
 
 

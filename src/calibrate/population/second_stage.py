@@ -28,10 +28,10 @@ from calibrate.samplers.protocol import Context, Draws
 from calibrate.statistical_model import Model
 
 DRAWS = 4000  # of a member: those of its prior, and the most that are used of its posterior
-# Shares of the population's draws that count after weighing: a tail is judged where fewer than half
-# do (sums over draws are rough where the population's sd is below their distance, which makes few
-# weights large), and below a tenth weights are not used.
-GOOD_SHARE, LEAST_SHARE = 0.5, 0.1
+LEAST_SHARE = 0.1  # of the population's draws that count after weighing, for weights to be used
+# Nats by which log likelihoods may err: a smooth error of that sd moves means by as many posterior
+# sds, of which a certificate allows as many.
+LARGEST_ERROR = 0.25
 _LATER = 0x9E3779B9  # keeps keys apart from the sampler's
 _WIDER = 1.5  # prior of members sampled again, over the population in sds
 _SCORES = 100  # members not seen, from which that prior is made, at each draw's
@@ -69,10 +69,15 @@ class Stage:
         return effective(self._weights[0]) / len(self._weights[0])
 
     @property
+    def error(self) -> float:
+        """The sd of the log likelihood, in nats, that the members have few draws for."""
+        return float(np.sqrt(self._weights[0] @ self.weighed.variance))
+
+    @property
     def weighs(self) -> bool:
         """Whether the members' draws are enough to weigh the population's."""
-        least = LEAST_SHARE if self.shape <= LARGEST_PARETO_SHAPE else GOOD_SHARE
-        return self.share >= least
+        sharp = self.shape <= LARGEST_PARETO_SHAPE and self.share >= LEAST_SHARE
+        return sharp and self.error <= LARGEST_ERROR
 
     def rows(self, seed: int) -> np.ndarray:
         """Return the rows (s,) of the draws that stand for the posterior, chain by chain.
