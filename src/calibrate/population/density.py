@@ -133,7 +133,8 @@ def density_of_population(model: PopulationModel) -> PopulationDensity:
         log_weight, variance, chosen = map(
             np.asarray, at_draws(jax.random.split(key, len(z)), jnp.asarray(z), mixtures, alone)
         )
-        return Weighed(log_weight, variance, chosen, np.array([_in_use(column) for column in chosen.T]))
+        in_use = np.array([_in_use(column) for column in chosen.T])
+        return Weighed(log_weight, variance, chosen, in_use)
 
     return PopulationDensity(
         log_density,

@@ -48,14 +48,13 @@ def likelihood_of(
     draws : (s, k), and log_prior : (s,) the log density of its prior there. prior : draws (r, k).
     """
     centre, covariance = prior.mean(axis=0), np.atleast_2d(np.cov(prior.T))
-    root = np.linalg.cholesky(covariance)
-    white = np.linalg.solve(root, (draws - centre).T).T
+    back = np.linalg.inv(np.linalg.cholesky(covariance))
+    white = (draws - centre) @ back.T
     log_weight = -0.5 * np.sum(white**2, axis=1) - log_prior
     weight = np.exp(log_weight - log_weight.max())
     rows = rng.choice(len(white), len(white), p=weight / weight.sum())
     parts = [_part(*part) for part in zip(*_fitted(white[rows], rng), strict=True)]
     constant, slope, precision = map(np.stack, zip(*parts, strict=True))
-    back = np.linalg.inv(root)
     return Mixtures(centre, constant, slope @ back, back.T @ precision @ back)
 
 

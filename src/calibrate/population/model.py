@@ -53,7 +53,6 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
-from jax.scipy.linalg import solve_triangular
 from jax.scipy.special import ndtr, ndtri
 from jax.typing import ArrayLike
 
@@ -62,6 +61,7 @@ from calibrate.state_names import split
 from calibrate.statistical_model import Model
 from calibrate.statistical_model.prior_range import standardised
 from emulator.core.errors import InputError
+from emulator.core.small_matrices import eliminate
 from emulator.scenes.parameter_space import Parameter
 
 MEDIAN, SD, CHOLESKY = "median", "sd", "correlation_cholesky"
@@ -196,9 +196,11 @@ class PopulationModel:
         low, high = self.ends
         far = jnp.all((mean - low > _FAR * sd) & (high - mean > _FAR * sd))
         q, slope = jax.lax.cond(far, uncut, cut)
-        inverse = solve_triangular(population.factor, jnp.eye(len(self.shared)), lower=True)
-        z = jnp.einsum("kl,...l->...k", inverse, q)
-        determinant = jnp.sum(jnp.log(jnp.diagonal(population.factor)))
+        pivots, rows = eliminate(
+            population.factor, jnp.eye(len(self.shared))
+        )  # L^-1 = rows / pivots
+        z = jnp.einsum("kl,...l->...k", rows / pivots[:, None], q)
+        determinant = jnp.sum(jnp.log(pivots))
         return -0.5 * jnp.sum(z**2, axis=-1) - jnp.sum(jnp.log(slope), axis=-1) - determinant
 
     def shared_values(self, population: PopulationDraws, z: jax.Array) -> dict[str, jax.Array]:

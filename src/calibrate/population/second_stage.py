@@ -28,7 +28,9 @@ from calibrate.samplers.protocol import Context, Draws
 from calibrate.statistical_model import Model
 
 DRAWS = 4000  # of a member: those of its prior, and the most that are used of its posterior
-LEAST_SHARE = 0.1  # of the population's draws that count after weighing, for weights to be used
+# Shares of the population's draws that count after weighing: a tail is judged where fewer than half
+# do, and below a tenth weights are not used.
+GOOD_SHARE, LEAST_SHARE = 0.5, 0.1
 # Nats by which log likelihoods may err: a smooth error of that sd moves means by as many posterior
 # sds, of which a certificate allows as many.
 LARGEST_ERROR = 0.25
@@ -76,8 +78,8 @@ class Stage:
     @property
     def weighs(self) -> bool:
         """Whether the members' draws are enough to weigh the population's."""
-        sharp = self.shape <= LARGEST_PARETO_SHAPE and self.share >= LEAST_SHARE
-        return sharp and self.error <= LARGEST_ERROR
+        least = LEAST_SHARE if self.shape <= LARGEST_PARETO_SHAPE else GOOD_SHARE
+        return self.share >= least and self.error <= LARGEST_ERROR
 
     def rows(self, seed: int) -> np.ndarray:
         """Return the rows (s,) of the draws that stand for the posterior, chain by chain.

@@ -61,8 +61,7 @@ def _simulator(
         return Simulator(scene, NewtonOptions.load_steps(load_steps, most=100), executor)
     if load_steps != 1:
         raise InputError(
-            f"load steps {load_steps}: '{scene.name}' is solved in steps of its own; leave "
-            "--load-steps out"
+            f"'{scene.name}' has steps of its own; leave out --load-steps {load_steps}"
         )
     (made,) = offered(*scene.solved_by.split(":"))
     solver: EquilibriumSolver = made(scene, executor=executor)

@@ -137,7 +137,9 @@ def test_draws_have_names_and_units(found):
     assert set(found.member("b2")) == {"mu", "lam", "noise_sd"}
     assert set(found.member("b0")) == {"mu", "lam"}
     assert found.tree["posterior"]["mu"].attrs["units"] == "kPa"
-    np.testing.assert_array_equal(found.tree["posterior"]["mu"].attrs["box"], [50.0, 100.0, 0.0, np.inf])
+    np.testing.assert_array_equal(
+        found.tree["posterior"]["mu"].attrs["box"], [50.0, 100.0, 0.0, np.inf]
+    )
     assert np.all(np.abs(draws["correlation[mu, lam]"]) < 1.0)
     assert np.all((draws["mu[b1]"] > 50.0) & (draws["mu[b1]"] < 100.0))
     assert "Population of 5 members" in repr(found)
