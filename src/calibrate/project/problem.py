@@ -60,9 +60,7 @@ def _simulator(
     if isinstance(scene, Scene):
         return Simulator(scene, NewtonOptions.load_steps(load_steps, most=100), executor)
     if load_steps != 1:
-        raise InputError(
-            f"'{scene.name}' has steps of its own; leave out --load-steps {load_steps}"
-        )
+        raise InputError(f"'{scene.name}' has steps of its own; omit --load-steps {load_steps}")
     (made,) = offered(*scene.solved_by.split(":"))
     solver: EquilibriumSolver = made(scene, executor=executor)
     return solver

@@ -100,7 +100,7 @@ def test_simulate_tells_each_row_and_the_error_of_its_steps(folder, capsys):
         (["infer", "--observe", "volume", "--out", "x"], "has 0 cavities"),
         (
             ["infer", "--observe", FORCE, "--noise", f"{FORCE}=1", "--load-steps", "4", "--out", "x"],
-            "'cube' has steps of its own; leave out --load-steps 4",
+            "'cube' has steps of its own; omit --load-steps 4",
         ),
         (["train", "--out", "x"], "goes through a history"),
         (["campaign", "--samples", "2", "--out", "x.zarr"], "goes through a history"),
