@@ -196,10 +196,9 @@ class PopulationModel:
         low, high = self.ends
         far = jnp.all((mean - low > _FAR * sd) & (high - mean > _FAR * sd))
         q, slope = jax.lax.cond(far, uncut, cut)
-        pivots, rows = eliminate(
-            population.factor, jnp.eye(len(self.shared))
-        )  # L^-1 = rows / pivots
-        z = jnp.einsum("kl,...l->...k", rows / pivots[:, None], q)
+        pivots, rows = eliminate(population.factor, jnp.eye(len(self.shared)))
+        inverse = rows / pivots[:, None]
+        z = jnp.einsum("kl,...l->...k", inverse, q)
         determinant = jnp.sum(jnp.log(pivots))
         return -0.5 * jnp.sum(z**2, axis=-1) - jnp.sum(jnp.log(slope), axis=-1) - determinant
 
