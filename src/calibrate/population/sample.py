@@ -23,11 +23,12 @@ from calibrate.population.second_stage import (
 from calibrate.posterior import sample
 from calibrate.provenance import as_attributes, describe_distribution, versions
 from calibrate.samplers import NUTSOptions, check_options
+from calibrate.samplers.diagnostics import REFUSE_ABOVE_R_HAT, r_hat
 from calibrate.samplers.nuts import NUTS
 from calibrate.samplers.protocol import Context
 from calibrate.statistical_model import Data, Model
 from calibrate.statistical_model.density import density_of, prior_draws
-from emulator.core.errors import check_arguments
+from emulator.core.errors import SolverError, check_arguments
 from emulator.core.machine import one_blas_thread
 
 _MOST_ROUNDS = 3  # of members
@@ -93,15 +94,25 @@ def sample_population(
     options = check_options(NUTS, options, density.dimension)
     how, sampler = (alone, alone) if isinstance(alone, str) else ("given", "auto")
     if isinstance(alone, str):
-        alone = _members(model.members, data, sampler, seed, progress=progress)
-    members, first = dict(model.members), as_many(alone)
+        alone = {
+            name: _draws(member, data.get(name), sampler, seed + i, progress=progress)
+            for i, (name, member) in enumerate(model.members.items())
+        }
+    members, draws, first = dict(model.members), dict(alone), as_many(alone)
     stage = second_stage(model, density, members, first, options, Context(seed, progress))
-    rounds = 1
-    while not stage.weighs and rounds < _MOST_ROUNDS:
-        members = under_population(model, density, stage)
-        later = _members(members, data, sampler, seed + rounds, progress=progress)
+    rounds, cheap = 1, all(density_of(member).batches for member in members.values())
+    while cheap and not stage.weighs and rounds < _MOST_ROUNDS:
+        for i, (name, member) in enumerate(under_population(model, density, stage).items()):
+            try:
+                later = _draws(
+                    member, data.get(name), sampler, seed + rounds + i, progress=progress
+                )
+            except SolverError:
+                continue  # with its earlier draws, and a warning if they are too few
+            if _agree(later):
+                members[name], draws[name] = member, later
         context = Context(seed + rounds, progress)
-        stage = second_stage(model, density, members, as_many(later), options, context)
+        stage = second_stage(model, density, members, as_many(draws), options, context)
         rounds += 1
     tree = make_tree(model, density, stage, seed)
     tree[ALONE] = tree_of_alone(first, tuple(model.shared), stage.weighed.in_use)
@@ -109,30 +120,25 @@ def sample_population(
     return Hierarchy(tree)
 
 
-def _members(
-    members: Mapping[str, Model],
-    data: Mapping[str, Data],
-    sampler: str,
-    seed: int,
-    *,
-    progress: bool,
-) -> dict[str, dict[str, np.ndarray]]:
-    """Return draws (s,) of all unknowns by member, each alone; from its prior without data."""
-    by_member = {}
-    for i, (member, member_model) in enumerate(members.items()):
-        if member in data:
-            values = {name: np.asarray(y) for name, y in data[member].items()}
-            posterior = sample(
-                member_model, values, sampler=sampler, seed=seed + i, progress=progress,
-                predictions=False,
-            )  # fmt: skip
-            draws: Mapping[str, Any] = posterior.draws()
-        else:
-            density = density_of(member_model)
-            z = prior_draws(density, jax.random.key(seed + i), DRAWS)
-            draws = density.constrain(jnp.asarray(z))
-        by_member[member] = {name: np.asarray(values) for name, values in draws.items()}
-    return by_member
+def _draws(
+    member: Model, data: Data | None, sampler: str, seed: int, *, progress: bool
+) -> dict[str, np.ndarray]:
+    """Return draws (chains, s) of all unknowns of one member; without data (s,) of its prior."""
+    if data is None:
+        density = density_of(member)
+        z = prior_draws(density, jax.random.key(seed), DRAWS)
+        drawn: Mapping[str, Any] = density.constrain(jnp.asarray(z))
+    else:
+        values = {name: np.asarray(y) for name, y in data.items()}
+        drawn = sample(
+            member, values, sampler=sampler, seed=seed, progress=progress, predictions=False
+        ).draws()
+    return {name: np.asarray(values) for name, values in drawn.items()}
+
+
+def _agree(draws: Mapping[str, np.ndarray]) -> bool:
+    """Return whether chains agree; draws of a prior do."""
+    return all(np.ndim(v) == 1 or r_hat(v) <= REFUSE_ABOVE_R_HAT for v in draws.values())
 
 
 def _provenance(

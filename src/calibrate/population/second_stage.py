@@ -36,7 +36,6 @@ GOOD_SHARE, LEAST_SHARE = 0.5, 0.1
 LARGEST_ERROR = 0.25
 _LATER = 0x9E3779B9  # keeps keys apart from the sampler's
 _WIDER = 1.5  # prior of members sampled again, over the population in sds
-_SCORES = 100  # members not seen, from which that prior is made, at each draw's
 
 Named = Mapping[str, Mapping[str, np.ndarray]]
 """Draws (s,) of all unknowns of each member, by member and name."""
@@ -175,7 +174,10 @@ def on_scales(model: PopulationModel, draws: Mapping[str, Any]) -> np.ndarray:
 
 
 def _log_prior(model: PopulationModel, member: Model, draws: Mapping[str, jax.Array]) -> np.ndarray:
-    """Return the log density (s,) of shared unknowns on their scales, from a member's prior."""
+    """Return the log density (s,) of shared unknowns on their scales, from a member's prior.
+
+    Where it is zero, as it may be at the very end of a range, it is infinite: of no weight.
+    """
 
     def at(draw: dict[str, jax.Array]) -> jax.Array:
         log_density = jnp.zeros(())
@@ -186,4 +188,5 @@ def _log_prior(model: PopulationModel, member: Model, draws: Mapping[str, jax.Ar
                 log_density += jnp.log(draw[name])
         return log_density
 
-    return np.asarray(jax.vmap(at)(dict(draws)))
+    log_density = np.asarray(jax.vmap(at)(dict(draws)))
+    return np.where(np.isfinite(log_density), log_density, np.inf)

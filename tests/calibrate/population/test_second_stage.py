@@ -11,11 +11,12 @@ import pytest
 from scipy.special import logsumexp
 
 import calibrate as cal
-from calibrate.population import mixtures, population_model, second_stage
+from calibrate.population import mixtures, population_model, sample, second_stage
 from calibrate.population.density import density_of_population
 from calibrate.population.second_stage import as_many, under_population
 from calibrate.samplers import NUTSOptions
 from calibrate.samplers.protocol import Context
+from emulator.core.errors import SolverError
 from linear_support import linear_forward
 
 OPTIONS = NUTSOptions(warmup=300, draws=750, chains=2, rounds=1)
@@ -146,6 +147,29 @@ def test_members_again_under_the_population_are_the_same(model, draws, exact):
     stage = staged(model, again, members)
     assert stage.weighs
     close(model, stage, exact)
+
+
+def test_members_that_cannot_be_sampled_again_keep_their_draws(model, draws, monkeypatch):
+    """One fails, the chains of another disagree: told, and no end of the others."""
+    few = {name: {"mu": of["mu"][::100]} for name, of in draws.items()}
+    apart = {"mu": np.stack([np.linspace(60.0, 61.0, 20), np.linspace(80.0, 81.0, 20)])}
+    asked = []
+
+    def sampled(member, data, sampler, seed, *, progress):
+        asked.append(seed)
+        if len(asked) % 2:
+            raise SolverError("it has no answer")
+        return apart
+
+    monkeypatch.setattr(sample, "_draws", sampled)
+    data = {name: {} for name in MEMBERS}
+    options = NUTSOptions(warmup=100, draws=100, chains=2, rounds=1)
+    found = sample.sample_population(model, data, options=options, alone=few, seed=0)
+    assert len(asked) == 2 * len(MEMBERS)
+    assert found.tree.attrs["member_rounds"] == 3
+    assert np.isin(found.member("a")["mu"], few["a"]["mu"]).all()
+    (sentence,) = [s for s in found.warnings() if "the population rests on" in s]
+    assert "take more draws of each" in sentence
 
 
 def test_as_many_draws_of_each_member_as_the_fewest_have():
