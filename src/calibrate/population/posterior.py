@@ -15,7 +15,7 @@ import xarray as xr
 from calibrate.arviz import base
 from calibrate.population.density import PopulationDensity
 from calibrate.population.model import MEDIAN, SD, PopulationModel
-from calibrate.population.second_stage import Stage
+from calibrate.population.second_stage import LARGEST_ERROR, Stage
 from calibrate.posterior import predictions, read_tree
 from calibrate.posterior.box import BoxEnd, box_ends
 from calibrate.posterior.diagnosis import diagnose, summary_of
@@ -168,14 +168,22 @@ class Hierarchy(TableRepr):
         return [*self._unweighed(), *self._of_chains()]
 
     def _unweighed(self) -> Iterator[str]:
-        """Yield a sentence where the members' draws are too few to weigh the population's."""
-        if self.tree.attrs.get(WEIGHS, 1):
+        """Yield a sentence where the members' draws are too few for the population's."""
+        error = self.tree.attrs.get(ERROR, 0.0)
+        weighs = self.tree.attrs.get(WEIGHS, 1)
+        if weighs and error <= LARGEST_ERROR:
             return
         in_use = np.asarray(self.tree[ALONE][IN_USE])
         worst = int(np.argmin(in_use))
+        fault = (
+            f"too few: its log likelihood errs by {error:.2g} nats, and its means by as many of "
+            "their sds"
+        )
+        if not weighs:
+            fault = "too few to check it: it is that of normals fitted to the members"
         yield (
-            f"the population rests on {in_use[worst]:.0f} draws of {self.members[worst]}, too few "
-            "to check it: it is that of normals fitted to the members; take more draws of each"
+            f"the population rests on {in_use[worst]:.0f} draws of {self.members[worst]}, {fault}; "
+            "take more draws of each"
         )
 
     def _of_chains(self) -> list[str]:

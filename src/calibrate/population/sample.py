@@ -101,7 +101,8 @@ def sample_population(
     members, draws, first = dict(model.members), dict(alone), as_many(alone)
     stage = second_stage(model, density, members, first, options, Context(seed, progress))
     rounds, cheap = 1, all(density_of(member).batches for member in members.values())
-    while cheap and not stage.weighs and rounds < _MOST_ROUNDS:
+    # As many draws again, of nearly the same prior, would not make the log likelihood more exact.
+    while cheap and not (stage.exact or (stage.weighs and rounds > 1)) and rounds < _MOST_ROUNDS:
         for i, (name, member) in enumerate(under_population(model, density, stage).items()):
             try:
                 later = _draws(

@@ -78,7 +78,12 @@ class Stage:
     def weighs(self) -> bool:
         """Whether the members' draws are enough to weigh the population's."""
         least = LEAST_SHARE if self.shape <= LARGEST_PARETO_SHAPE else GOOD_SHARE
-        return self.share >= least and self.error <= LARGEST_ERROR
+        return self.share >= least
+
+    @property
+    def exact(self) -> bool:
+        """Whether they are also enough for its log likelihood."""
+        return self.weighs and self.error <= LARGEST_ERROR
 
     def rows(self, seed: int) -> np.ndarray:
         """Return the rows (s,) of the draws that stand for the posterior, chain by chain.
