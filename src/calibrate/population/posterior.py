@@ -29,7 +29,7 @@ from emulator.scenes.parameter_space import Parameter
 
 ALONE, NEW, CORRELATION = "alone", "new_member", "correlation"
 IN_USE = "draws_in_use"  # of each member
-# Of the weights of the population's draws; the last is in nats of the log likelihood.
+# These describe the weights of the population's draws; the last is in nats.
 SHAPE, SHARE, ERROR = "pareto_shape", "effective_share", "log_likelihood_error"
 WEIGHS = "weighed"  # whether they are used
 _NEW = 0x85EBCA6B  # keeps the key of members not seen apart from the sampler's

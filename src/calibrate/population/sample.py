@@ -101,7 +101,7 @@ def sample_population(
     members, draws, first = dict(model.members), dict(alone), as_many(alone)
     stage = second_stage(model, density, members, first, options, Context(seed, progress))
     rounds, cheap = 1, all(density_of(member).batches for member in members.values())
-    # As many draws again, of nearly the same prior, would not make the log likelihood more exact.
+    # A third round would not make the log likelihood more exact, with as many draws as the second.
     while cheap and not (stage.exact or (stage.weighs and rounds > 1)) and rounds < _MOST_ROUNDS:
         for i, (name, member) in enumerate(under_population(model, density, stage).items()):
             try:

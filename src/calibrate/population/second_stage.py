@@ -1,9 +1,9 @@
 """The second stage: the population from draws of its members, weighted by what they say.
 
-The stages of :func:`calibrate.population.hierarchy`. Members alone; NUTS of the population by the
-members' mixtures; weights of its draws by the members' draws (:mod:`calibrate.population.density`).
-Where these are too few near the population to weigh it, members are sampled again, with the
-population that was found as their prior, and the second stage is repeated.
+In :func:`calibrate.population.hierarchy` members are sampled alone. Then NUTS samples the
+population by the members' mixtures, and the members' draws weigh the result
+(:mod:`calibrate.population.density`). If these are too few near the population to weigh it, members
+are sampled again with the population as their prior, and the second stage is repeated.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from calibrate.importance.proposals import resampled
 from calibrate.importance.weights import LARGEST_PARETO_SHAPE, effective, normalised, smoothed
 from calibrate.population.density import Alone, PopulationDensity, Weighed
 from calibrate.population.mixtures import likelihood_of, stacked
@@ -76,29 +77,26 @@ class Stage:
 
     @property
     def weighs(self) -> bool:
-        """Whether the members' draws are enough to weigh the population's."""
+        """True where the members' draws are enough to weigh the population's."""
         least = LEAST_SHARE if self.shape <= LARGEST_PARETO_SHAPE else GOOD_SHARE
         return self.share >= least
 
     @property
     def exact(self) -> bool:
-        """Whether they are also enough for its log likelihood."""
+        """True where they are also enough for the population's log likelihood."""
         return self.weighs and self.error <= LARGEST_ERROR
 
     def rows(self, seed: int) -> np.ndarray:
         """Return the rows (s,) of the draws that stand for the posterior, chain by chain.
 
-        Systematic resampling within each chain; all rows as they are where nothing can be weighed.
+        Rows are taken by weight within each chain; where nothing can be weighed, all stay.
         """
         chains, draws = self.draws.z.shape[:2]
         if not self.weighs:
             return np.arange(chains * draws)
-        rng, rows = np.random.default_rng(seed), []
-        for chain, weights in enumerate(self._weights[0].reshape(chains, draws)):
-            at = (np.arange(draws) + rng.uniform()) / draws
-            taken = np.searchsorted(np.cumsum(weights) / weights.sum(), at)
-            rows.append(chain * draws + taken.clip(max=draws - 1))
-        return np.concatenate(rows)
+        rng, by_chain = np.random.default_rng(seed), self._weights[0].reshape(chains, draws)
+        taken = [np.sort(resampled(weights, draws, rng)) for weights in by_chain]
+        return np.concatenate([chain * draws + rows for chain, rows in enumerate(taken)])
 
 
 def second_stage(
@@ -181,17 +179,13 @@ def on_scales(model: PopulationModel, draws: Mapping[str, Any]) -> np.ndarray:
 def _log_prior(model: PopulationModel, member: Model, draws: Mapping[str, jax.Array]) -> np.ndarray:
     """Return the log density (s,) of shared unknowns on their scales, from a member's prior.
 
-    Where it is zero, as it may be at the very end of a range, it is infinite: of no weight.
+    A draw of density zero, as there may be at the very end of a range, gets infinity in place of
+    its logarithm, so that it has no weight.
     """
 
     def at(draw: dict[str, jax.Array]) -> jax.Array:
-        log_density = jnp.zeros(())
-        for name, parameter in model.shared.items():
-            prior = member.given_earlier(name, member.prior[name], draw)
-            log_density += prior.log_prob(draw[name])
-            if parameter.scale == "log":
-                log_density += jnp.log(draw[name])
-        return log_density
+        logarithms = [n for n, parameter in model.shared.items() if parameter.scale == "log"]
+        return member.log_prior(draw) + sum(jnp.log(draw[name]) for name in logarithms)
 
     log_density = np.asarray(jax.vmap(at)(dict(draws)))
     return np.where(np.isfinite(log_density), log_density, np.inf)

@@ -168,9 +168,9 @@ class Model:
         return draws
 
     def log_prior(self, values: Mapping[str, jax.Array]) -> jax.Array:
-        """Return the log density of theta's prior, (), at ``values``, a number by name."""
+        """Return the log prior density, (), of those unknowns of theta that ``values`` has."""
         log_density = jnp.zeros(())
-        for name in self.states.unknowns:
+        for name in filter(values.__contains__, self.states.unknowns):
             prior = self.given_earlier(name, self.prior[name], values)
             log_density += prior.log_prob(values[name])
         return log_density
